@@ -93,7 +93,7 @@ YARN_PARAMETERS: tuple[Parameter, ...] = (
         "Fraction of the yarn's cross-section that is filled by fibers; used only where fiber_radius is 0.",
     ),
     Parameter(
-        "inclination", "u_max", "rad", "float", 0.6, (0.01, 3.1), (0.1, 1.5),
+        "inclination", "u_max", "rad", "float", 0.6, (0.01, 1.57), (0.1, 1.5),
         "Inclination of the centre line at the ends of a segment (Li et al. 2024, eq. 5).",
         ("network", "raster"),
         paper=_all(Uniform(0.1, 1.5)),

@@ -167,7 +167,7 @@ def _checked_matrix(matrix: ArrayLike, place: str) -> NDArray[np.uint8]:
 
 
 def _is_grouped_plain(matrix: NDArray[np.uint8]) -> bool:
-    """Whether it is plain weave of groups, all groups of picks equally thick and all groups of ends, and one above 1."""
+    """Whether it is plain weave of groups: all groups of picks equally thick, all of ends too, and one above 1."""
     lengths = []
     for m in (matrix, matrix.T):
         if not all(np.array_equal(row, m[0]) or np.array_equal(row, 1 - m[0]) for row in m):

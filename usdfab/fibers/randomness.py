@@ -1,0 +1,39 @@
+"""Counted randomness: draws are hashes of (seed, system, yarn, fiber, segment, channel), never a running generator.
+
+So a fiber has the same shape whatever else is generated, in whatever order and on however many threads.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtri
+
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
+
+def _mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """The 64-bit finaliser of SplitMix64 (Steele, Lea, Flood 2014): every input bit reaches every output bit."""
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+
+
+def hash_integers(*keys: ArrayLike) -> NDArray[np.uint64]:
+    """A 64-bit hash of broadcast integer keys; the order of the keys matters."""
+    arrays = np.broadcast_arrays(*(np.asarray(k, dtype=np.int64) for k in keys))
+    state = np.zeros(arrays[0].shape, dtype=np.uint64)
+    with np.errstate(over="ignore"):
+        for array in arrays:
+            state = _mix(state + _GOLDEN + array.astype(np.uint64))
+    return state
+
+
+def uniform(*keys: ArrayLike) -> NDArray[np.float64]:
+    """U(0, 1), open at both ends, for broadcast integer keys."""
+    return ((hash_integers(*keys) >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
+
+
+def normal(*keys: ArrayLike) -> NDArray[np.float64]:
+    """N(0, 1) for broadcast integer keys."""
+    return ndtri(uniform(*keys))
