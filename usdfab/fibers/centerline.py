@@ -29,7 +29,7 @@ def unit_centerline(y: Any, length: Any, inclination: Any) -> Any:
     array like ``y``: ``z_hyb / (r - r cos u)`` of Li et al. 2024, eq. 6, without beta.
     """
     xp = array_namespace(y, length)
-    u = xp.asarray(inclination, dtype=y.dtype)
+    u = inclination if hasattr(inclination, "dtype") else xp.asarray(float(inclination), dtype=y.dtype)
     r = length / (2.0 * xp.sin(u))
     offset = y - 0.5 * length  # y - r sin u
     z_cir = xp.sqrt(r * r - offset * offset) - r * xp.cos(u)  # eq. 5, arc

@@ -174,9 +174,9 @@ def _raw(shape: YarnShape, layout: Layout, draws: Draws, fiber: NDArray, shift: 
     q = shape.irregularity
     shape2 = np.broadcast_shapes(fiber.shape, place.shape)
     noise = q * perlin3(
-        q * xp.asarray(np.broadcast_to(yarn.astype(float), shape2)),
+        q * xp.asarray(yarn + np.zeros(shape2)),
         q * xp.asarray(fiber.astype(float)),
-        q * xp.asarray(np.broadcast_to(SEGMENT_INDEX_PER_CELL * place, shape2)) + xp.asarray(draws.xi[yarn, fiber]),
+        q * xp.asarray(SEGMENT_INDEX_PER_CELL * place + np.zeros(shape2)) + xp.asarray(draws.xi[yarn, fiber]),
         draws.noise_seed,
     )
     return radius * xp.cos(angle), radius * xp.sin(angle) + shape.crimp * center, noise

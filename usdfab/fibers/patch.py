@@ -146,7 +146,8 @@ def generate_patch(
         across, height = fiber_offsets(shape, layout, draws, successor)
         along_cell, across_cell = (dx, dy) if name == "weft" else (dy, dx)
         along = np.broadcast_to(layout.position * along_cell, across.shape)
-        across = across + (layout.yarn + 0.5) * across_cell
+        # (x, y, z) is right-handed but (y, x, z) is left-handed; Z twist is to be positive in both systems.
+        across = (across if name == "weft" else -across) + (layout.yarn + 0.5) * across_cell
         first, second = (along, across) if name == "weft" else (across, along)
         points = np.stack([first, second, height], axis=-1)
         colors = np.asarray(yarn.colors())

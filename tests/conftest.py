@@ -1,0 +1,16 @@
+"""Shared by all tests. usdfab.usd is imported first: the schema must be registered before any stage exists."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "2")
+
+from hypothesis import HealthCheck, settings
+
+import usdfab.usd
+
+settings.register_profile("usdfab", deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("usdfab")
+
+assert usdfab.usd.__name__ == "usdfab.usd"

@@ -1,0 +1,159 @@
+"""A fiber patch as an Embree scene: everything that overlaps one tile, so that the tile can repeat for ever.
+
+Curves are the cubic B-splines that the expanded USD asset and Mitsuba draw. Embree gets them as round linear segments
+whose vertices lie on the spline, with the spline's tangent kept at each vertex, so that the shading frame is smooth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from usdfab.fabric import FabricParameters, YarnParameters
+from usdfab.fibers import FiberSystem, Patch, generate_patch
+from usdfab.scattering.fiber_numba import pack_fiber
+from usdfab.tracer.embree import NEIGHBOR_LEFT, NEIGHBOR_RIGHT, EmbreeScene, curve_scene
+
+TILE_CELLS = 4
+"""A tile has at least this many cells on each side: rays cross its border less often, and repetition shows less."""
+
+MAX_TILE_SEGMENTS = 1_500_000
+"""Beyond this a tile stays at one repeat of the weave."""
+
+
+@dataclass(frozen=True)
+class PatchScene:
+    """One tile, ready for the kernels. Lengths in metres.
+
+    ``tangents`` (V, 3) float32 unit; ``segment_vertex`` (S,) first vertex of each segment; ``segment_material`` (S,)
+    row of ``materials`` (M, N), each packed by ``pack_fiber``; ``albedo`` (M, 3) the fiber albedo coefficients.
+    """
+
+    size: tuple[float, float]
+    z_range: tuple[float, float]
+    scene: EmbreeScene
+    tangents: NDArray[np.float32]
+    segment_vertex: NDArray[np.int32]
+    segment_material: NDArray[np.int32]
+    materials: NDArray[np.float64]
+    albedo: NDArray[np.float64]
+    epsilon: float
+    """Shortest ray: hits nearer than this are the surface the ray starts on."""
+
+
+def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> PatchScene:
+    """The patch of a fabric (or the given one) as an Embree scene with packed fiber materials."""
+    if patch is None:
+        patch = generate_patch(fabric, copies=tile_copies(fabric))
+    vertices, tangents, first, flags, material = [], [], [], [], []
+    materials: list[NDArray] = []
+    albedo: list[tuple[float, ...]] = []
+    base = 0
+    for system in patch.systems:
+        yarn = fabric.system(system.system)
+        colors, color_of_curve = np.unique(system.albedo, axis=0, return_inverse=True)
+        v, t, f, g, curve = _tile_segments(system, patch.size)
+        vertices.append(np.c_[v, np.full(len(v), system.radius)])
+        tangents.append(t)
+        first.append(f + base)
+        flags.append(g)
+        material.append(color_of_curve.reshape(-1)[curve] + len(materials))
+        base += len(v)
+        materials.extend(_pack(yarn, tuple(c)) for c in colors)
+        albedo.extend(tuple(c) for c in colors)
+    segment_vertex = np.concatenate(first).astype(np.int32)
+    scene = curve_scene(np.concatenate(vertices), segment_vertex, np.concatenate(flags))
+    low, high = patch.z_range
+    radius = min(s.radius for s in patch.systems)
+    return PatchScene(
+        size=patch.size,
+        z_range=(low - 1e-3 * radius, high + 1e-3 * radius),
+        scene=scene,
+        tangents=np.concatenate(tangents).astype(np.float32),
+        segment_vertex=segment_vertex,
+        segment_material=np.concatenate(material).astype(np.int32),
+        materials=np.stack(materials),
+        albedo=np.asarray(albedo),
+        epsilon=5e-3 * radius,
+    )
+
+
+def tile_copies(fabric: FabricParameters) -> tuple[int, int]:
+    """Repeats of the weave along x and y that make up one tile."""
+    picks, ends = fabric.repeat()
+    copies = max(1, -(-TILE_CELLS // ends)), max(1, -(-TILE_CELLS // picks))
+    segments = sum(
+        copies[0] * copies[1] * fabric.system(s).fiber_count * 40 * 2 * (ends if s == "warp" else picks)
+        for s in ("warp", "weft")
+    )
+    return copies if segments <= MAX_TILE_SEGMENTS else (1, 1)
+
+
+def _pack(yarn: YarnParameters, color: tuple[float, ...]) -> NDArray[np.float64]:
+    return pack_fiber(
+        np.maximum(np.asarray(color, dtype=float), 1e-4),  # C = 0 would be infinitely absorbing
+        yarn.roughness_longitudinal,
+        yarn.roughness_azimuthal,
+        yarn.roughness_primary,
+        eta=yarn.ior,
+        tilt=yarn.cuticle_tilt,
+    )
+
+
+def spline_vertices(system: FiberSystem) -> tuple[NDArray, NDArray, NDArray[np.int64]]:
+    """Points and unit tangents of the curves' cubic B-splines at their knots, one vertex before and three after.
+
+    Returns
+    -------
+    points, tangents: (M, 3); offsets: (curves + 1,). Vertex ``1`` of a curve belongs to its first control point.
+    """
+    control, offsets = system.extended(2, 4)
+    points = (control[:-2] + 4.0 * control[1:-1] + control[2:]) / 6.0
+    tangents = control[2:] - control[:-2]
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    lengths = np.diff(offsets)
+    keep = np.ones(len(control), dtype=bool)
+    keep[offsets[:-1]] = keep[offsets[1:] - 1] = False
+    inner = keep[1:-1]
+    return points[inner], tangents[inner], np.r_[0, np.cumsum(lengths - 2)]
+
+
+def _tile_segments(
+    system: FiberSystem, size: tuple[float, float]
+) -> tuple[NDArray, NDArray, NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]:
+    """All segments that overlap the tile [0, size], copies from the neighbouring tiles included.
+
+    Returns vertices (V, 3), tangents (V, 3), first vertex (S,), neighbour flags (S,) and curve (S,).
+    """
+    points, tangents, offsets = spline_vertices(system)
+    curve_of_vertex = np.repeat(np.arange(system.curves), np.diff(offsets))
+    place = np.arange(len(points)) - offsets[:-1][curve_of_vertex]
+    lengths = np.diff(offsets)[curve_of_vertex]
+    # A curve's own segments: from vertex 1 up to the first vertex of its successor, one vertex spare on either side.
+    starts = np.flatnonzero((place >= 1) & (place <= lengths - 4))
+    low = np.minimum(points[starts], points[starts + 1])[:, :2] - system.radius
+    high = np.maximum(points[starts], points[starts + 1])[:, :2] + system.radius
+
+    out_v, out_t, out_f, out_c = [], [], [], []
+    base = 0
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            shift = np.array([i * size[0], j * size[1], 0.0])
+            inside = np.all((high + shift[:2] > 0.0) & (low + shift[:2] < np.asarray(size)), axis=1)
+            chosen = starts[inside]
+            if not len(chosen):
+                continue
+            used = np.zeros(len(points), dtype=bool)
+            for k in (-1, 0, 1, 2):
+                used[chosen + k] = True
+            new_index = np.cumsum(used) - 1
+            out_v.append(points[used] + shift)
+            out_t.append(tangents[used])
+            out_f.append(new_index[chosen] + base)
+            out_c.append(curve_of_vertex[chosen])
+            base += int(used.sum())
+    first = np.concatenate(out_f)
+    flags = np.full(len(first), NEIGHBOR_LEFT | NEIGHBOR_RIGHT, dtype=np.uint8)
+    return np.concatenate(out_v), np.concatenate(out_t), first, flags, np.concatenate(out_c)
