@@ -53,7 +53,8 @@ ESCAPED_UP, ESCAPED_DOWN, HIT = 1, -1, 0
 
 
 class Patches(NamedTuple):
-    """All tiles of a scene. ``table`` (P, 8): width, height, lowest z, highest z, epsilon, first segment, first vertex.
+    """All tiles of a scene. ``table`` (P, 8): width, height, lowest z, highest z, epsilon, first segment, first vertex, units
+    per metre.
 
     ``handles`` (P,) Embree scenes; the other arrays are those of ``PatchScene``, one patch after the other.
     """
@@ -100,8 +101,8 @@ def _enter_slab(macro, patches, prim, u, v, dx, dy, dz, t):  # type: ignore[no-u
     patch = int(macro.surfaces[macro.material[prim], 0])
     table = patches.table[patch]
     uv = macro.uv[prim]
-    px = w * uv[0, 0] + u * uv[1, 0] + v * uv[2, 0]
-    py = w * uv[0, 1] + u * uv[1, 1] + v * uv[2, 1]
+    px = table[7] * (w * uv[0, 0] + u * uv[1, 0] + v * uv[2, 0])
+    py = table[7] * (w * uv[0, 1] + u * uv[1, 1] + v * uv[2, 1])
     g = macro.geometric[prim]
     n = macro.normals[prim]
     nx = w * n[0, 0] + u * n[1, 0] + v * n[2, 0]
@@ -129,7 +130,7 @@ def _enter_slab(macro, patches, prim, u, v, dx, dy, dz, t):  # type: ignore[no-u
     sign = macro.sign[prim]
     bx, by, bz = sign * (ny * tz - nz * ty), sign * (nz * tx - nx * tz), sign * (nx * ty - ny * tx)
 
-    scale = macro.scale[prim]
+    scale = table[7] * macro.scale[prim]
     # Step back from the mid-surface to the side of the slab that the ray comes from.
     border = table[3] if across < 0.0 else -table[2]
     thickness = table[3] - table[2]

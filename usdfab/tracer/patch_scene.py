@@ -19,13 +19,17 @@ from usdfab.tracer.embree import NEIGHBOR_LEFT, NEIGHBOR_RIGHT, EmbreeScene, cur
 TILE_CELLS = 4
 """A tile has at least this many cells on each side: rays cross its border less often, and repetition shows less."""
 
+FIBER_RADIUS_UNITS = 0.1
+"""Radius of the thinnest fiber in patch space. Embree's curve intersector has thresholds that are not relative: in
+metres, with fibers of 1e-5, it returns wrong places along the segment."""
+
 MAX_TILE_SEGMENTS = 1_500_000
 """Beyond this a tile stays at one repeat of the weave."""
 
 
 @dataclass(frozen=True)
 class PatchScene:
-    """One tile, ready for the kernels. Lengths in metres.
+    """One tile, ready for the kernels. Lengths in units of which ``units_per_meter`` make a metre.
 
     ``tangents`` (V, 3) float32 unit; ``segment_vertex`` (S,) first vertex of each segment; ``segment_material`` (S,)
     row of ``materials`` (M, N), each packed by ``pack_fiber``; ``albedo`` (M, 3) the fiber albedo coefficients.
@@ -39,6 +43,7 @@ class PatchScene:
     segment_material: NDArray[np.int32]
     materials: NDArray[np.float64]
     albedo: NDArray[np.float64]
+    units_per_meter: float
     epsilon: float
     """Shortest ray: hits nearer than this are the surface the ray starts on."""
 
@@ -47,6 +52,8 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
     """The patch of a fabric (or the given one) as an Embree scene with packed fiber materials."""
     if patch is None:
         patch = generate_patch(fabric, copies=tile_copies(fabric))
+    radius = min(s.radius for s in patch.systems)
+    units = FIBER_RADIUS_UNITS / radius
     vertices, tangents, first, flags, material = [], [], [], [], []
     materials: list[NDArray] = []
     albedo: list[tuple[float, ...]] = []
@@ -55,7 +62,7 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
         yarn = fabric.system(system.system)
         colors, color_of_curve = np.unique(system.albedo, axis=0, return_inverse=True)
         v, t, f, g, curve = _tile_segments(system, patch.size)
-        vertices.append(np.c_[v, np.full(len(v), system.radius)])
+        vertices.append(units * np.c_[v, np.full(len(v), system.radius)])
         tangents.append(t)
         first.append(f + base)
         flags.append(g)
@@ -66,17 +73,17 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
     segment_vertex = np.concatenate(first).astype(np.int32)
     scene = curve_scene(np.concatenate(vertices), segment_vertex, np.concatenate(flags))
     low, high = patch.z_range
-    radius = min(s.radius for s in patch.systems)
     return PatchScene(
-        size=patch.size,
-        z_range=(low - 1e-3 * radius, high + 1e-3 * radius),
+        size=(units * patch.size[0], units * patch.size[1]),
+        z_range=(units * (low - 1e-3 * radius), units * (high + 1e-3 * radius)),
         scene=scene,
         tangents=np.concatenate(tangents).astype(np.float32),
         segment_vertex=segment_vertex,
         segment_material=np.concatenate(material).astype(np.int32),
         materials=np.stack(materials),
         albedo=np.asarray(albedo),
-        epsilon=5e-3 * radius,
+        units_per_meter=units,
+        epsilon=5e-3 * FIBER_RADIUS_UNITS,
     )
 
 

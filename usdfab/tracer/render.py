@@ -143,7 +143,7 @@ def _pack_patches(scenes: list[PatchScene]) -> Patches:
     rows, material_base, segment_base, vertex_base = [], 0, 0, 0
     segment_material = [np.zeros(0, dtype=np.int32)]
     for scene in scenes:
-        rows.append([*scene.size, *scene.z_range, scene.epsilon, segment_base, vertex_base, 0.0])
+        rows.append([*scene.size, *scene.z_range, scene.epsilon, segment_base, vertex_base, scene.units_per_meter])
         segment_material.append(scene.segment_material + np.int32(material_base))
         material_base += len(scene.materials)
         segment_base += len(scene.segment_vertex)

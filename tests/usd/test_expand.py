@@ -1,0 +1,291 @@
+"""Fibers in USD files: copies on the surface, curves that join, files that others can read."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
+
+from usdfab.errors import UsdfabError
+from usdfab.fabric import FabricParameters, YarnParameters, preset
+from usdfab.fibers import generate_patch
+from usdfab.usd.check import check
+from usdfab.usd.expand import expand
+from usdfab.usd.fabric_io import define_fabric_material, read_fabric
+from usdfab.usd.placement import estimate, place
+
+PATCHES = "/World/Cloth_fibers/Patches"
+FEW = {"fiber_count": 5}
+
+
+@pytest.fixture
+def small() -> FabricParameters:
+    """Plain weave with a patch of exactly 1 mm x 0.5 mm and few fibers; the weft has two colours."""
+    warp = YarnParameters(count=10, radius=2e-4, **FEW)
+    weft = YarnParameters(count=20, radius=1e-4, yarn_albedo=((1, 0, 0), (0, 0, 1)), **FEW)
+    return FabricParameters(size=(5e-3, 5e-3), warp=warp, weft=weft)
+
+
+def grid(n: int, side: float):
+    """(n + 1)^2 points of a square and its n^2 quads."""
+    line = np.linspace(0, side, n + 1)
+    points = [(x, y, 0.0) for y in line for x in line]
+    faces = [[j * (n + 1) + i, j * (n + 1) + i + 1, (j + 1) * (n + 1) + i + 1, (j + 1) * (n + 1) + i]
+             for j in range(n) for i in range(n)]  # fmt: skip
+    return points, faces
+
+
+@pytest.fixture
+def cloth(tmp_path, new_mesh, small) -> Path:
+    """A file in centimetres, y up: a turned and moved cloth of 1 cm x 1 cm whose uv is in units of 1 cm."""
+    path = tmp_path / "cloth.usda"
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    world = UsdGeom.Xform.Define(stage, "/World")
+    world.AddTranslateOp().Set(Gf.Vec3d(100, 20, -30))
+    world.AddRotateXYZOp().Set(Gf.Vec3f(20, 40, 60))
+    world.AddScaleOp().Set(Gf.Vec3f(2, 3, 4))
+    stage.SetDefaultPrim(world.GetPrim())
+    points, faces = grid(3, 1.0)
+    points = [(x / 2, y / 3, z) for x, y, z in points]
+    mesh = new_mesh(stage, "/World/Cloth", points, faces, [(2 * x, 3 * y) for x, y, _ in points])
+    mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(mesh.GetPointsAttr().Get()))
+    mesh.CreateNormalsAttr([Gf.Vec3f(0, 0, 1)] * len(points))
+    UsdGeom.Scope.Define(stage, "/World/Looks")
+    material = define_fabric_material(stage, "/World/Looks/Fabric", small)
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    stage.SetMetadata("kilogramsPerUnit", 1.0)
+    stage.Save()
+    return path
+
+
+def world_transforms(stage, path=PATCHES):
+    """(N, 4, 4) column-vector matrices from prototype space to world, and the instancer."""
+    instancer = UsdGeom.PointInstancer(stage.GetPrimAtPath(path))
+    time = Usd.TimeCode.Default()
+    local = np.array(instancer.ComputeInstanceTransformsAtTime(time, time, UsdGeom.PointInstancer.IncludeProtoXform))
+    to_world = np.array(instancer.ComputeLocalToWorldTransform(time))
+    return np.swapaxes(local @ to_world, 1, 2), instancer
+
+
+# --- the file --------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_written(cloth, tmp_path, small):
+    before = cloth.read_bytes()
+    result = expand(cloth, tmp_path / "fibers.usda", vertices_per_segment=6)
+    assert cloth.read_bytes() == before
+    assert result.instances == 10 * 20
+    assert result.meshes == ("/World/Cloth",) and result.warnings == ()
+    stage = Usd.Stage.Open(str(result.path))
+    layer = stage.GetRootLayer()
+    assert list(layer.subLayerPaths) == ["cloth.usda"]
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 0.01 and UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert stage.GetDefaultPrim().GetPath() == "/World"
+    assert not layer.GetAttributeAtPath("/World/Cloth.points")
+    mesh = UsdGeom.Imageable(stage.GetPrimAtPath("/World/Cloth"))
+    assert mesh.ComputeVisibility() == "invisible"
+    prototypes = stage.GetPrimAtPath(f"{PATCHES}/Prototypes")
+    assert prototypes.GetSpecifier() == Sdf.SpecifierOver and not prototypes.IsDefined()
+    curves = {c.GetName(): UsdGeom.BasisCurves(c) for c in prototypes.GetChild("Patch").GetAllChildren()}
+    assert set(curves) == {"Warp", "Weft_0", "Weft_1"}
+    assert sum(len(c.GetCurveVertexCountsAttr().Get()) for c in curves.values()) == result.curves == 20
+    for name, c in curves.items():
+        assert (c.GetTypeAttr().Get(), c.GetBasisAttr().Get(), c.GetWrapAttr().Get()) == (
+            "cubic",
+            "bspline",
+            "nonperiodic",
+        )
+        assert c.GetNormalsAttr().Get() is None
+        radius = (small.warp if name == "Warp" else small.weft).effective_fiber_radius
+        np.testing.assert_allclose(c.GetWidthsAttr().Get(), [2 * radius / 0.01], rtol=1e-6)
+        assert c.GetWidthsInterpolation() == "constant"
+        np.testing.assert_allclose(c.GetExtentAttr().Get(), UsdGeom.Curves.ComputeExtent(
+            c.GetPointsAttr().Get(), c.GetWidthsAttr().Get()), rtol=1e-5)  # fmt: skip
+        assert "MaterialBindingAPI" in c.GetPrim().GetAppliedSchemas()
+        bound = UsdShade.MaterialBindingAPI(c.GetPrim()).ComputeBoundMaterial()[0]
+        assert bound.GetPath() == "/World/Looks/Fabric"
+        api = UsdGeom.PrimvarsAPI(c)
+        assert api.GetPrimvar("usdfab:yarn").GetInterpolation() == "uniform"
+        assert len(api.GetPrimvar("usdfab:fiber").Get()) == len(c.GetCurveVertexCountsAttr().Get())
+    np.testing.assert_allclose(curves["Weft_0"].GetDisplayColorAttr().Get(), [(0, 0, 1)])
+    np.testing.assert_allclose(curves["Weft_1"].GetDisplayColorAttr().Get(), [(1, 0, 0)])
+
+
+@pytest.mark.parametrize("suffix", [".usda", ".usdc"])
+def test_the_file_is_clean(cloth, tmp_path, suffix):
+    path = expand(cloth, tmp_path / f"fibers{suffix}", vertices_per_segment=6).path
+    assert check(path) == []
+    if suffix == ".usda":
+        return  # NVIDIA's checker wants large arrays in .usdc, and is right
+    nvidia = pytest.importorskip("usd_validation_nvidia")
+    logging.disable(logging.WARNING)
+    issues = nvidia.ValidationEngine().validate(str(path)).issues()
+    logging.disable(logging.NOTSET)
+    # about the user's own stage: its units and axis are not ours to choose
+    assert [str(i) for i in issues if "fibers" in str(i)] == []
+
+
+def test_extent_holds_all_fibers(cloth, tmp_path):
+    stage = Usd.Stage.Open(str(expand(cloth, tmp_path / "f.usda", vertices_per_segment=6).path))
+    _, instancer = world_transforms(stage)
+    low, high = np.array(instancer.GetExtentAttr().Get())
+    size = high - low
+    assert (np.abs(size) < 2).all() and (size > 0).all()
+    assert np.sort(size)[1:].min() > 0.9  # 1 cm in the stage's centimetres, turned
+
+
+# --- geometry --------------------------------------------------------------------------------------------------------
+
+
+def test_copies_lie_on_the_cloth_and_join(cloth, tmp_path):
+    stage = Usd.Stage.Open(str(expand(cloth, tmp_path / "f.usda", vertices_per_segment=6).path))
+    transforms, _ = world_transforms(stage)
+    assert len(transforms) == 200
+    # Where the cells should be: the mesh's own transform of uv, in the stage's centimetres.
+    world = np.array(UsdGeom.Xformable(stage.GetPrimAtPath("/World/Cloth")).ComputeLocalToWorldTransform(0)).T
+    columns, rows = np.meshgrid(np.arange(10), np.arange(20))
+    u, v = (columns.ravel() + 0.5) * 0.1, (rows.ravel() + 0.5) * 0.05
+    expected = np.column_stack([u / 2, v / 3, 0 * u, 0 * u + 1]) @ world.T
+    np.testing.assert_allclose(transforms[:, :3, 3], expected[:, :3], atol=1e-5)
+    # The cloth is as large as its uv in every direction, so that copies are neither stretched nor turned.
+    linear = world[:3, :3] / [2, 3, 4]
+    np.testing.assert_allclose(transforms[:, :3, :3], np.broadcast_to(linear, (200, 3, 3)), atol=2e-3)
+
+
+def spline_ends(points, counts):
+    """First and last point of each nonperiodic cubic B-spline."""
+    offsets = np.r_[0, np.cumsum(counts)]
+    weights = np.array([1, 4, 1]) / 6
+    first = np.stack([weights @ points[s : s + 3] for s in offsets[:-1]])
+    last = np.stack([weights @ points[e - 3 : e] for e in offsets[1:]])
+    return first, last
+
+
+def test_fibers_end_where_their_continuations_begin(cloth, tmp_path, small):
+    stage = Usd.Stage.Open(str(expand(cloth, tmp_path / "f.usda", vertices_per_segment=6).path))
+    patch = generate_patch(small, 6)
+    curves = UsdGeom.BasisCurves(stage.GetPrimAtPath(f"{PATCHES}/Prototypes/Patch/Warp"))
+    points = np.asarray(curves.GetPointsAttr().Get(), dtype=float) * 0.01
+    first, last = spline_ends(points, curves.GetCurveVertexCountsAttr().Get())
+    np.testing.assert_allclose(last, first[patch.warp.successor] + patch.warp.period, atol=1e-9)
+    low, high = points[:, 1].min(), points[:, 1].max()
+    assert -0.5 * patch.size[1] - 1e-4 < low and high < 0.5 * patch.size[1] + 4e-4
+
+
+def corners(points, faces):
+    """Triangles of quads as (T, 3, ...) arrays."""
+    f = np.asarray(faces)
+    return np.asarray(points)[np.concatenate([f[:, [0, 1, 2]], f[:, [0, 2, 3]]])]
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 8, 10, 20])
+def test_each_cell_is_placed_once_whatever_the_mesh(n):
+    # With 10 x 10 cells on grids of n x n quads, centres fall on edges, diagonals and corners of triangles.
+    points, faces = grid(n, 1.0)
+    p = corners(points, faces)
+    placed = place(p, p[..., :2], None, (0.1, 0.1), 1.0)
+    assert len(placed.cells) == 100
+    assert len(np.unique(placed.cells, axis=0)) == 100
+    np.testing.assert_allclose(placed.positions[:, :2], (placed.cells + 0.5) * 0.1, atol=1e-12)
+    assert estimate(p[..., :2], (0.1, 0.1)) == pytest.approx(100)
+
+
+def test_turned_grids_place_each_cell_once():
+    points, faces = grid(7, 1.0)
+    p = corners(points, faces)
+    turn = np.array([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]])
+    placed = place(p, p[..., :2] @ turn.T, None, (0.02, 0.03), 1.0)
+    assert len(np.unique(placed.cells, axis=0)) == len(placed.cells)
+    assert len(placed.cells) == pytest.approx(1 / 0.0006, rel=0.02)
+    # the weft runs along +u
+    np.testing.assert_allclose(placed.rotations[0][:, 0], [math.cos(0.3), -math.sin(0.3), 0], atol=1e-12)
+
+
+def test_frames_on_a_cylinder():
+    n, radius = 200, 0.5
+    angle = np.linspace(0, math.pi, n + 1)
+    points = [(radius * math.cos(a), radius * math.sin(a), z) for z in (0.0, 1.0) for a in angle]
+    uv = [(radius * a, z) for z in (0.0, 1.0) for a in angle]
+    faces = [[i, i + 1, n + 2 + i, n + 1 + i] for i in range(n)]
+    p = corners(points, faces)
+    normals = p * [1, 1, 0] / np.linalg.norm(p * [1, 1, 0], axis=2, keepdims=True)
+    placed = place(p, corners(uv, faces), normals, (0.05, 0.05), 1.0)
+    assert len(placed.positions) == pytest.approx(0.5 * math.pi / 0.0025, rel=0.02)
+    a = (placed.cells[:, 0] + 0.5) * 0.05 / radius
+    zero = 0 * a
+    expected = np.stack([np.stack([-np.sin(a), np.cos(a), zero], 1), np.stack([zero, zero, zero + 1], 1),
+                         np.stack([np.cos(a), np.sin(a), zero], 1)], axis=2)  # fmt: skip
+    np.testing.assert_allclose(placed.rotations, expected, atol=0.01)
+    np.testing.assert_allclose(placed.scales, 1, atol=1e-3)
+    np.testing.assert_allclose(np.linalg.det(placed.rotations), 1)
+
+
+def test_mirrored_and_stretched_uv():
+    points, faces = grid(2, 1.0)
+    p = corners(points, faces)
+    mirrored = place(p, p[..., :2] * [-1, 1], None, (0.25, 0.25), 1.0)
+    np.testing.assert_allclose(mirrored.rotations[0][:, 0], [-1, 0, 0])
+    np.testing.assert_allclose(mirrored.rotations[0][:, 2], [0, 0, 1])
+    np.testing.assert_allclose(np.linalg.det(mirrored.rotations), 1)
+    np.testing.assert_allclose(mirrored.scales, np.broadcast_to([1, -1, 1], (16, 3)))
+    # rotation times scale is the affine map of the uv, front to the front: dp/du, dp/dv
+    stretched = place(p, p[..., :2] * [0.5, 2], None, (0.25, 0.25), 1.0)
+    np.testing.assert_allclose(stretched.scales, np.broadcast_to([2, 0.5, 1], (16, 3)))
+    assert len(stretched.positions) == 16
+
+
+# --- options and errors ----------------------------------------------------------------------------------------------
+
+
+def test_region(cloth, tmp_path):
+    assert expand(cloth, tmp_path / "f.usda", region=(0, 0, 0.5, 0.25), vertices_per_segment=6).instances == 25
+
+
+def test_a_given_fabric_brings_its_material(cloth, tmp_path):
+    denim = replace(preset("denim"), size=(4e-3, 4e-3))
+    path = expand(cloth, tmp_path / "f.usda", denim, vertices_per_segment=4).path
+    stage = Usd.Stage.Open(str(path))
+    curves = stage.GetPrimAtPath(f"{PATCHES}/Prototypes/Patch/Warp")
+    bound = UsdShade.MaterialBindingAPI(curves).ComputeBoundMaterial()[0]
+    assert read_fabric(stage, bound.GetPath()) == denim
+    assert check(path) == []
+
+
+def test_what_cannot_be_hidden_is_said(cloth, tmp_path):
+    stage = Usd.Stage.Open(str(cloth))
+    stage.GetPrimAtPath("/World").SetInstanceable(False)
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/Cloth"))
+    grey = UsdShade.Material.Define(stage, "/World/Looks/Grey")
+    subset = UsdGeom.Subset.CreateGeomSubset(mesh, "part", "face", [0], "materialBind")
+    UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(grey)
+    UsdLux.DiskLight.Define(stage, "/World/Disk")
+    stage.Save()
+    result = expand(cloth, tmp_path / "f.usda", vertices_per_segment=6)
+    text = "\n".join(result.warnings)
+    assert "only some faces are cloth" in text and "DiskLight" in text
+    assert 0 < result.instances < 200
+
+
+def test_errors(cloth, tmp_path, new_mesh):
+    out = tmp_path / "f.usda"
+    with pytest.raises(UsdfabError, match=r"about 200 copies .* above 100"):
+        expand(cloth, out, max_instances=100)
+    with pytest.raises(UsdfabError, match=r"</World/Nope>: there is no mesh with a fabric"):
+        expand(cloth, out, prim="/World/Nope")
+    with pytest.raises(UsdfabError, match="no patch cell has its centre on the cloth"):
+        expand(cloth, out, region=(5, 5, 6, 6))
+    with pytest.raises(UsdfabError, match="the file to write is the file to read"):
+        expand(cloth, cloth, overwrite=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cloth.usda"]
+    stage = Usd.Stage.CreateNew(str(tmp_path / "bare.usda"))
+    new_mesh(stage, "/M", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [[0, 1, 2]])
+    stage.Save()
+    with pytest.raises(UsdfabError, match="there is no mesh with a fabric; bind one"):
+        expand(tmp_path / "bare.usda", out)

@@ -1,0 +1,69 @@
+"""Opening stages, and saying where in a stage something is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pxr import Sdf, Tf, Usd, UsdGeom
+
+from usdfab._version import __version__
+from usdfab.errors import UsdfabError
+from usdfab.usd.registration import require_schema
+
+GENERATOR = f"usdfab {__version__}"
+
+
+def open_stage(source: str | Path | Usd.Stage) -> Usd.Stage:
+    """The stage of a file, or the stage itself.
+
+    Raises
+    ------
+    UsdfabError
+        If the file is missing, a folder, or nothing that USD can read.
+    """
+    require_schema()
+    if isinstance(source, Usd.Stage):
+        return source
+    path = Path(source)
+    if not path.exists():
+        raise UsdfabError("the file does not exist", place=str(path))
+    if path.is_dir():
+        raise UsdfabError("this is a folder, not a USD file", place=str(path))
+    if not Sdf.FileFormat.FindByExtension(path.suffix):
+        raise UsdfabError("this is not a USD file", place=str(path), remedy="USD files are .usda, .usdc, .usd, .usdz")
+    try:
+        return Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        lines = str(error).strip().splitlines()
+        reason = lines[-1].strip() if lines else "unreadable"
+        raise UsdfabError(f"USD cannot read the file ({reason})", place=str(path)) from error
+
+
+def stage_name(stage: Usd.Stage) -> str:
+    """File name of a stage as people know it; ``anonymous`` for one in memory."""
+    layer = stage.GetRootLayer()
+    return "anonymous stage" if layer.anonymous else (layer.realPath or layer.identifier)
+
+
+def site(stage: Usd.Stage, where: Any) -> str:
+    """``file</prim.attr>`` for a prim, a property or a path."""
+    path = where if isinstance(where, Sdf.Path) else where.GetPath()
+    return f"{stage_name(stage)}<{path}>"
+
+
+def new_stage(up_axis: str = "Z") -> Usd.Stage:
+    """An in-memory stage in metres with its up axis, generator and metadata authored."""
+    require_schema()
+    stage = Usd.Stage.CreateInMemory()
+    author_stage_metadata(stage, up_axis)
+    return stage
+
+
+def author_stage_metadata(stage: Usd.Stage, up_axis: str = "Z") -> None:
+    """Author metersPerUnit = 1, kilogramsPerUnit = 1, the up axis and usdfab's generator mark."""
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z if up_axis == "Z" else UsdGeom.Tokens.y)
+    stage.SetMetadata("kilogramsPerUnit", 1.0)
+    layer = stage.GetRootLayer()
+    layer.customLayerData = {**layer.customLayerData, "usdfab": {"generator": GENERATOR}}
