@@ -9,7 +9,7 @@ import numpy as np
 from usdfab.fabric import FabricParameters
 from usdfab.fibers import Patch
 from usdfab.scattering.roughness import absorption_from_albedo
-from usdfab.usd.scene import Camera, PointLight
+from usdfab.usd.scene import Camera, DomeLight, PointLight
 
 
 UNITS = 1e5
@@ -68,6 +68,9 @@ def mitsuba_dict(
         },
     }
     for k, light in enumerate(lights):
+        if isinstance(light, DomeLight):
+            scene[f"light{k}"] = {"type": "constant", "radiance": {"type": "rgb", "value": light.radiance.tolist()}}
+            continue
         assert isinstance(light, PointLight)
         scene[f"light{k}"] = {
             "type": "point",

@@ -24,6 +24,7 @@ from usdfab.scattering.fiber_numba import (
     fiber_angles,
     fiber_direction,
     fiber_frame,
+    load_fiber,
     prepare_fiber,
     sample_fiber,
 )
@@ -386,7 +387,7 @@ def _trace_path(world, buffer, stream, ox, oy, oz, dx, dy, dz, max_depth, out): 
             nx, ny, nz = nx - dot * ax, ny - dot * ay, nz - dot * az
             norm = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
             nx, ny, nz = nx * norm, ny * norm, nz * norm
-            material = patches.materials[patches.segment_material[segment]]
+            material = load_fiber(patches.materials, patches.segment_material[segment])
             px = dx * r[0] + dy * r[1] + dz * r[2]
             py = dx * r[3] + dy * r[4] + dz * r[5]
             pz = dx * r[6] + dy * r[7] + dz * r[8]
