@@ -215,7 +215,7 @@ def test_outputs_that_are_refused(tmp_path, fabric):
 
 
 def test_unwritable_folder(tmp_path, fabric, monkeypatch):
-    monkeypatch.setattr("usdfab.usd.atomic.os.access", lambda *_: False)
+    monkeypatch.setattr("usdfab.files.os.access", lambda *_: False)
     with pytest.raises(UsdfabError, match="the folder is not writable"):
         write_fabric(fabric, tmp_path / "f.usda")
 

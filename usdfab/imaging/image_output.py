@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from usdfab.errors import UsdfabError
+from usdfab.files import checked_output, whole_file
 from usdfab.imaging.color import linear_to_srgb
 from usdfab.imaging.openimageio import captured_stderr, openimageio
 from usdfab.imaging.resolution import PixelSize
@@ -77,7 +76,7 @@ def write_image(
         For an unknown suffix, a missing or unwritable folder, an existing file, pixels that are NaN or infinite,
         arrays whose shapes do not fit, and a disk that refuses.
     """
-    target = _checked_output(path, overwrite)
+    target = checked_output(path, OUTPUT_SUFFIXES, overwrite=overwrite, kind="images")
     place, suffix = str(target), target.suffix.lower()
     picture = _checked_pixels(pixels, place)
     if bits not in (8, 16):
@@ -105,22 +104,6 @@ def encoded(pixels: ArrayLike, bits: int = 8) -> NDArray[Any]:
     top = 2**bits - 1
     codes = linear_to_srgb(np.clip(np.asarray(pixels, dtype=np.float64), 0.0, 1.0)) * top
     return np.round(codes).astype(np.uint8 if bits == 8 else np.uint16)
-
-
-def _checked_output(path: str | Path, overwrite: bool) -> Path:
-    target, place = Path(path), str(path)
-    if target.suffix.lower() not in OUTPUT_SUFFIXES:
-        kinds = ", ".join(OUTPUT_SUFFIXES)
-        raise UsdfabError(f"cannot write '{target.suffix}' images", place=place, remedy=f"use {kinds}")
-    if target.is_dir():
-        raise UsdfabError("a folder is in the file's place", place=place, remedy="choose another name")
-    if target.exists() and not overwrite:
-        raise UsdfabError("the file exists", place=place, remedy="choose another name or ask for overwriting")
-    if not target.parent.is_dir():
-        raise UsdfabError("the folder does not exist", place=place, remedy=f"create {target.parent} first")
-    if not os.access(target.parent, os.W_OK):
-        raise UsdfabError("the folder is not writable", place=place, remedy="choose another folder")
-    return target
 
 
 def _checked_pixels(pixels: ArrayLike, place: str) -> NDArray[np.float32]:
@@ -196,9 +179,8 @@ def _save(oiio: Any, target: Path, spec: Any, data: NDArray[Any]) -> None:
     # libjpeg ends the whole process on a full disk, so that one is asked about beforehand.
     if target.suffix.lower() in (".jpg", ".jpeg") and shutil.disk_usage(target.parent).free < data.nbytes:
         raise UsdfabError("the disk is full", place=place, remedy="make room or choose another folder")
-    temporary = target.with_name(f".{target.stem}.{uuid.uuid4().hex[:12]}{target.suffix.lower()}")
     try:
-        with captured_stderr():
+        with whole_file(target) as temporary, captured_stderr():
             output = oiio.ImageOutput.create(str(temporary))
             if output is None:
                 raise UsdfabError(f"cannot be written ({oiio.geterror()})", place=place)
@@ -211,8 +193,5 @@ def _save(oiio: Any, target: Path, spec: Any, data: NDArray[Any]) -> None:
                     place=place,
                     remedy="check the disk and the folder's permissions",
                 )
-        temporary.replace(target)
     except OSError as error:
         raise UsdfabError(f"cannot be written ({error.strerror})", place=place) from error
-    finally:
-        temporary.unlink(missing_ok=True)

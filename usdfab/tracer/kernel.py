@@ -54,8 +54,9 @@ ESCAPED_UP, ESCAPED_DOWN, HIT = 1, -1, 0
 
 
 class Patches(NamedTuple):
-    """All tiles of a scene. ``table`` (P, 8): width, height, lowest z, highest z, epsilon, first segment, first vertex, units
-    per metre.
+    """All tiles of a scene.
+
+    ``table`` (P, 8): width, height, lowest z, highest z, epsilon, first segment, first vertex, units per metre.
 
     ``handles`` (P,) Embree scenes; the other arrays are those of ``PatchScene``, one patch after the other.
     """
@@ -502,8 +503,8 @@ CHANNELS = 12
 def render_rows(world, view, seed, rows, first_sample, samples, max_depth, film, squares):  # type: ignore[no-untyped-def]
     """Add samples to the pixels of ``rows`` (first, last + 1) of ``film`` (H, W, CHANNELS), squares to ``squares``.
 
-    Runs without Python's lock, so that threads can share the work; a pixel belongs to one call at a time and its samples
-    are added in order, so the sum is the same bit for bit however rows are shared out.
+    Runs without Python's lock, so that threads can share the work; a pixel belongs to one call at a time and its
+    samples are added in order, so the sum is the same bit for bit however rows are shared out.
     """
     width, height = view.width, view.height
     m = view.to_world

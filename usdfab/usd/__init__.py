@@ -4,7 +4,6 @@ Importing this package registers usdfab's USD schema (:mod:`usdfab.usd.registrat
 opened.
 """
 
-from usdfab.usd.registration import register as register
-from usdfab.usd.registration import require_schema as require_schema
+from usdfab.usd.registration import register as register, require_schema as require_schema
 
 register()

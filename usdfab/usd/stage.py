@@ -67,3 +67,11 @@ def author_stage_metadata(stage: Usd.Stage, up_axis: str = "Z") -> None:
     stage.SetMetadata("kilogramsPerUnit", 1.0)
     layer = stage.GetRootLayer()
     layer.customLayerData = {**layer.customLayerData, "usdfab": {"generator": GENERATOR}}
+
+
+def has_geometry(stage: Usd.Stage) -> bool:
+    """Whether the stage holds anything that could be drawn (a Gprim, an instancer), visible or not."""
+    return any(
+        prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer)
+        for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
+    )

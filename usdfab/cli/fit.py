@@ -1,0 +1,106 @@
+"""``usdfab fit``: from a photo to a fabric."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from usdfab.cli.options import Json, Output, Overwrite, Quiet, Seed, print_json, progress_bar, say
+
+if TYPE_CHECKING:
+    from usdfab.fit.pipeline import Fit
+
+
+def run(
+    photo: Path,
+    /,
+    *,
+    output: Output,
+    size: Annotated[str | None, Parameter(help="Physical width of the picture, e.g. 3.6mm.")] = None,
+    pixel_size: Annotated[str | None, Parameter(help="Physical size of a pixel, e.g. 7.5um.")] = None,
+    report: Annotated[Path | None, Parameter(help="Folder for pictures: photo, swatch, side by side.")] = None,
+    report_spp: Annotated[int, Parameter(help="Samples per pixel of the report's swatch.")] = 64,
+    seed: Seed = 0,
+    overwrite: Overwrite = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Estimate a fabric from one photo of woven cloth, seen straight from above.
+
+    The analysis stage reads counts, weave, colours, widths and twist from the photo; fiber parameters it cannot see
+    are priors, and what is uncertain is said.
+
+    Usage examples:
+
+        usdfab fit photo.png -o fabric.usda --size 3.6mm
+        usdfab fit photo.tif -o fabric.usda --pixel-size 7.5um --report report --json
+
+    Parameters
+    ----------
+    photo:
+        PNG, JPEG, TIFF or EXR; yarns roughly along the picture's sides.
+    """
+    from usdfab.errors import UsdfabError
+    from usdfab.fabric import as_table, parse_length
+    from usdfab.files import checked_output
+    from usdfab.fit.pipeline import fit_photo
+    from usdfab.fit.report import write_report
+    from usdfab.usd.atomic import USD_SUFFIXES
+    from usdfab.usd.fabric_io import write_fabric
+
+    checked_output(output, USD_SUFFIXES, overwrite=overwrite)
+    if not 0 <= seed < 2**31:
+        raise UsdfabError(f"{seed} is not between 0 and 2^31 - 1", place="--seed")
+    width = parse_length(size) if size else None
+    pixel = parse_length(pixel_size) if pixel_size else None
+    with progress_bar("fitting", quiet=quiet) as update:
+        fit = fit_photo(photo, width, pixel, seed, lambda text, done, total: update(done, total, text))
+    write_fabric(fit.fabric, output, overwrite=overwrite)
+    pictures: dict[str, Path] = {}
+    if report is not None:
+        with progress_bar("rendering the report", quiet=quiet) as update:
+            pictures = write_report(fit, report, spp=report_spp, seed=seed, overwrite=overwrite, progress=update)
+    if not quiet:
+        for warning in fit.warnings:
+            say(f"warning: {warning}")
+    if json:
+        print_json({"output": output, "fabric": as_table(fit.fabric), "analysis": _analysis(fit), "pictures": pictures})
+    elif not quiet:
+        fabric = fit.fabric
+        say(
+            f"wrote {output}: {fabric.weave.classify()} weave, {fabric.weave.picks} x {fabric.weave.ends} repeat, "
+            f"{0.01 / fabric.cell[0]:.1f} ends/cm, {0.01 / fabric.cell[1]:.1f} picks/cm"
+        )
+        for path in pictures.values():
+            say(f"wrote {path}")
+
+
+def _analysis(fit: Fit) -> dict[str, Any]:
+    seen = fit.analysis
+    result: dict[str, Any] = {
+        "weave_class": seen.weave_class,
+        "weave_matrix": seen.weave.matrix.astype(int).tolist(),
+        "weave_confidence": seen.weave_confidence,
+        "lattice_confidence": seen.lattice_confidence,
+        "rotation_rad": seen.rotation,
+        "rotation_confidence": seen.rotation_confidence,
+        "gap_cover": seen.gap_cover,
+        "gap_confidence": seen.gap_confidence,
+        "size_source": fit.size_source,
+        "warnings": list(fit.warnings),
+    }
+    for name, system in (("warp", seen.warp), ("weft", seen.weft)):
+        result[name] = {
+            "count": system.count,
+            "count_confidence": system.count_confidence,
+            "width": system.width,
+            "width_confidence": system.width_confidence,
+            "colour": system.colour.tolist(),
+            "colour_confidence": system.colour_confidence,
+            "twist": system.twist,
+            "fiber_angle_rad": system.fiber_angle,
+            "twist_confidence": system.twist_confidence,
+        }
+    return result

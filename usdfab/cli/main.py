@@ -1,0 +1,76 @@
+"""The ``usdfab`` command: one module per sub-command, loaded when it runs.
+
+Exit codes: 0 done; 1 the check found errors; 2 bad input or usage; 130 interrupted.
+Results go to stdout, talk goes to stderr.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+from cyclopts import App, CycloptsError
+
+from usdfab._version import __version__
+from usdfab.errors import UsdfabError
+
+USAGE_ERROR, INTERRUPTED = 2, 130
+
+HELP = """From one microscope photo of woven cloth to a USD asset made of fibers, rendered at any distance.
+
+Usage examples:
+
+    usdfab fit photo.png -o fabric.usda --size 3.6mm --report report
+    usdfab render fabric.usda -o swatch.png
+    usdfab render cloth.usda --fabric fabric.usda -o cloth.exr
+    usdfab inspect fabric.usda
+"""
+
+COMMANDS = ("fit", "render", "inspect", "expand", "new", "edit", "info", "check", "evaluate", "schema")
+
+
+def make_app() -> App:
+    """The command-line application; commands are import strings, resolved when they run."""
+    app = App(
+        name="usdfab",
+        version=__version__,
+        help=HELP,
+        help_format="markdown",
+        result_action="return_value",
+    )
+    for name in COMMANDS:
+        app.command(f"usdfab.cli.{name}:run", name=name)
+    return app
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and end the process with its exit code."""
+    # The Numba cache must be writable also where the package is not.
+    code = _run(list(sys.argv[1:] if arguments is None else arguments))
+    sys.stdout.flush()
+    sys.stderr.flush()
+    raise SystemExit(code)
+
+
+def _run(arguments: list[str]) -> int:
+    try:
+        result = make_app()(arguments, exit_on_error=False, print_error=False)
+        return result if isinstance(result, int) else 0
+    except UsdfabError as error:
+        print(f"usdfab: {' '.join(str(error).split())}", file=sys.stderr)
+        return USAGE_ERROR
+    except CycloptsError as error:
+        print(f"usdfab: {' '.join(str(error).split())}; see usdfab --help", file=sys.stderr)
+        return USAGE_ERROR
+    except KeyboardInterrupt:
+        print("usdfab: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The reader of our output went away (usdfab info ... | head): not an error of ours.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+if __name__ == "__main__":
+    main()
