@@ -21,7 +21,7 @@ def run(
     size: Annotated[str | None, Parameter(help="Physical width of the picture, e.g. 3.6mm.")] = None,
     pixel_size: Annotated[str | None, Parameter(help="Physical size of a pixel, e.g. 7.5um.")] = None,
     report: Annotated[Path | None, Parameter(help="Folder for pictures: photo, swatch, side by side.")] = None,
-    report_spp: Annotated[int, Parameter(help="Samples per pixel of the report's swatch.")] = 64,
+    report_spp: Annotated[int, Parameter(help="Samples per pixel of the report's swatch.")] = 24,
     seed: Seed = 0,
     overwrite: Overwrite = False,
     json: Json = False,

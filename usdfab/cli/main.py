@@ -27,11 +27,23 @@ Usage examples:
     usdfab inspect fabric.usda
 """
 
-COMMANDS = ("fit", "render", "inspect", "expand", "new", "edit", "info", "check", "evaluate", "schema")
+COMMANDS = {
+    "fit": "Estimate a fabric from one photo of woven cloth.",
+    "render": "Render a fabric as a swatch, or a stage whose meshes wear fabrics.",
+    "inspect": "Look at the fibers of a fabric, in a window or as a picture.",
+    "expand": "Write the cloth of a stage as instanced fibers for any USD program.",
+    "new": "Write a new fabric from a preset or a weave.",
+    "edit": "Change parameters of a fabric.",
+    "info": "Print the fabrics of a file with all parameters.",
+    "check": "Check a USD file against USD's validators and usdfab's rules.",
+    "evaluate": "Judge usdfab's estimates on labelled photos.",
+    "schema": "Print the folder of usdfab's USD schema, for PXR_PLUGINPATH_NAME.",
+}
+"""One line for each command; its own page comes from the doc string of its function, which is loaded only then."""
 
 
-def make_app() -> App:
-    """The command-line application; commands are import strings, resolved when they run."""
+def make_app(chosen: str = "") -> App:
+    """The command-line application; commands are import strings, resolved when they run. ``chosen`` is about to run."""
     app = App(
         name="usdfab",
         version=__version__,
@@ -39,8 +51,11 @@ def make_app() -> App:
         help_format="markdown",
         result_action="return_value",
     )
-    for name in COMMANDS:
-        app.command(f"usdfab.cli.{name}:run", name=name)
+    for name, line in COMMANDS.items():
+        if name == chosen:
+            app.command(f"usdfab.cli.{name}:run", name=name)
+        else:
+            app.command(f"usdfab.cli.{name}:run", name=name, help=line)
     return app
 
 
@@ -55,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(arguments: list[str]) -> int:
     try:
-        result = make_app()(arguments, exit_on_error=False, print_error=False)
+        result = make_app(next(iter(arguments), ""))(arguments, exit_on_error=False, print_error=False)
         return result if isinstance(result, int) else 0
     except UsdfabError as error:
         print(f"usdfab: {' '.join(str(error).split())}", file=sys.stderr)

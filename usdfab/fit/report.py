@@ -15,7 +15,7 @@ from usdfab.imaging import side_by_side, write_image
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import swatch_scene
 
-HEIGHT = 720
+HEIGHT = 480
 """Rows of the report's pictures."""
 
 
@@ -23,7 +23,7 @@ def write_report(
     fit: Fit,
     folder: str | Path,
     *,
-    spp: int = 64,
+    spp: int = 24,
     seed: int = 0,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
