@@ -46,7 +46,10 @@ def _no_cloth() -> dict[str, NDArray[np.float64]]:
     }
 
 
-@pytest.mark.parametrize("name", _no_cloth())
+SLOW = ("smooth noise", "noisy gradient", "blob", "stripes", "rings", "dots")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in SLOW else []) for n in _no_cloth()])
 def test_no_lattice(name: str) -> None:
     with pytest.raises(UsdfabError, match="no woven lattice") as caught:
         analyze_photo(_grey(_no_cloth()[name]), "picture.png")

@@ -48,7 +48,7 @@ class Weave:
         """Make a weave from nested lists, or from text rows such as ``"10/01"``, written bottom row first."""
         if isinstance(rows, str):
             rows = [row for row in re.split(r"[/,;\s]+", rows.strip()) if row]
-        items = list(rows)  # type: ignore[arg-type]
+        items: list = list(rows)  # type: ignore[arg-type]
         if items and isinstance(items[0], str):
             if len({len(row) for row in items}) != 1 or any(set(row) - {"0", "1"} for row in items):
                 raise UsdfabError(

@@ -64,7 +64,9 @@ def reject_back_faces(arguments):  # type: ignore[no-untyped-def]
 
 def filter_address() -> int:
     """Address of ``reject_back_faces`` for the argument structure."""
-    return reject_back_faces.address
+    address = reject_back_faces.address
+    assert address is not None
+    return address
 
 
 @njit(cache=True, inline="always")

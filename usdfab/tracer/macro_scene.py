@@ -46,7 +46,7 @@ def build_macro(scene: Scene, patch_of_fabric: list[int]) -> tuple[Macro, Embree
     for row, material in zip(surfaces, scene.materials, strict=True):
         row[0] = patch_of_fabric[material.fabric] if material.fabric >= 0 else -1.0
         row[1:] = material.base_color
-    macro = Macro(*joined, surfaces)
+    macro = Macro(*joined, surfaces)  # type: ignore[call-arg]
     points = macro.points.reshape(-1, 3)
     low, high = points.min(axis=0), points.max(axis=0)
     embree = triangle_scene(points, np.arange(len(points)).reshape(-1, 3))

@@ -24,7 +24,7 @@ from usdfab.usd.scene import Camera, Scene
 MAX_PIXELS = 2**28
 ROWS_PER_TASK = 4
 Progress = Callable[[int, int], None]
-"""Called with (samples done, samples to do) after each pass."""
+"""Called with (work done, work to do), in rows times samples per pixel."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Tracer:
         return sum(len(s.segment_vertex) for s in self._scenes)
 
     def render(self, camera: Camera, settings: RenderSettings, progress: Progress | None = None) -> Render:
-        """Render what a camera sees. An interrupt (Ctrl-C) takes effect after the running pass."""
+        """Render what a camera sees. An interrupt (Ctrl-C) takes effect within a few rows."""
         width, height = resolve_resolution(camera, settings.resolution)
         if settings.spp < 1 or settings.max_depth < 1:
             raise UsdfabError(f"spp {settings.spp} and depth {settings.max_depth} must be at least 1")
@@ -114,11 +114,14 @@ class Tracer:
                     seed = np.uint64(settings.seed)
                     render_rows(self.world, view, seed, rows, first, samples, settings.max_depth, film, squares)
 
-                for _ in pool.map(work, chunks):
-                    pass
+                try:
+                    for rows, _ in zip(chunks, pool.map(work, chunks), strict=True):
+                        if progress:
+                            progress(done * height + samples * rows[1], settings.spp * height)
+                except BaseException:  # an interrupt must not wait for the rows that have not begun
+                    pool.shutdown(wait=True, cancel_futures=True)
+                    raise
                 done += samples
-                if progress:
-                    progress(done, settings.spp)
                 if settings.time_limit is not None and time.perf_counter() - start > settings.time_limit:
                     break
         return _develop(film, squares, done, camera.exposure, time.perf_counter() - start, self.segments)

@@ -7,11 +7,13 @@ interlacing of *two* systems scores. Blobs, noise and pictures of other things h
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from usdfab.fit.analysis.choose import Hypothesis
 from usdfab.fit.analysis.features import Array, Features
 from usdfab.fit.analysis.rectify import SUB
+from usdfab.fit.analysis.repeat import Lattice
 
 
 def fold_agreement(features: Features, hypothesis: Hypothesis) -> float:
@@ -31,11 +33,11 @@ def fold_agreement(features: Features, hypothesis: Hypothesis) -> float:
         blurred = blurred - ndimage.gaussian_filter(blurred, 2.5 * spacing)
         part = hypothesis.grid.sample(blurred)[oy : oy + rows * SUB, ox : ox + cols * SUB]
         blocks = part.reshape(rows, SUB, cols, SUB).transpose(0, 2, 1, 3)
-        best = max(best, _quarters(blocks, ids, cells.valid, hypothesis.fit.lattice.bits))
+        best = max(best, _quarters(blocks, ids, cells.valid, hypothesis.fit.lattice))
     return best
 
 
-def _quarters(blocks: Array, ids: np.ndarray, valid: np.ndarray, bits: int) -> float:
+def _quarters(blocks: Array, ids: NDArray[np.intp], valid: NDArray[np.bool_], lattice: Lattice) -> float:
     rows, cols = valid.shape
     i, j = np.mgrid[0:rows, 0:cols]
     ys, xs = np.flatnonzero(valid.any(1)), np.flatnonzero(valid.any(0))
@@ -43,25 +45,23 @@ def _quarters(blocks: Array, ids: np.ndarray, valid: np.ndarray, bits: int) -> f
     scores = []
     for q in range(4):
         inside, rest = valid & (quarter == q), valid & (quarter != q)
-        predicted = _tiles(blocks[rest], ids[rest], bits)
-        actual = _tiles(blocks[inside], ids[inside], bits)
-        both = np.isfinite(predicted).all((1, 2)) & np.isfinite(actual).all((1, 2))
-        if both.sum() < 2:
-            return 0.0
-        a, b = _interaction(actual[both]), _interaction(predicted[both])
+        a = _interlacing(_tiles(blocks[inside], ids[inside], lattice.bits), lattice)
+        b = _interlacing(_tiles(blocks[rest], ids[rest], lattice.bits), lattice)
         scores.append(float((a * b).sum() / (np.sqrt((a**2).sum() * (b**2).sum()) + 1e-12)))
     return float(np.mean(scores) - 0.5 * np.std(scores))
 
 
-def _tiles(blocks: Array, ids: np.ndarray, bits: int) -> Array:
-    """Mean (bits, SUB, SUB) block per class, NaN where a class is missing."""
-    out = np.full((bits, SUB, SUB), np.nan)
+def _tiles(blocks: Array, ids: NDArray[np.intp], bits: int) -> Array:
+    """Mean (bits, SUB, SUB) block per class; the mean of all where a class is missing."""
+    out = np.full((bits, SUB, SUB), blocks.mean(0) if len(blocks) else 0.0)
     for k in range(bits):
         if (ids == k).any():
             out[k] = blocks[ids == k].mean(0)
     return out
 
 
-def _interaction(tiles: Array) -> Array:
-    """Tiles (N, SUB, SUB) without their common tile: what changes from crossing to crossing."""
-    return tiles - tiles.mean(0)
+def _interlacing(tiles: Array, lattice: Lattice) -> Array:
+    """One repeat as a picture, without what each of its lines and columns has in common."""
+    rows, cols = lattice.shape
+    picture = tiles[lattice.classes(rows, cols)].transpose(0, 2, 1, 3).reshape(rows * SUB, cols * SUB)
+    return picture - picture.mean(0) - picture.mean(1)[:, None] + picture.mean()

@@ -19,7 +19,7 @@ from usdfab.fit.analysis.yarns import Blocks, colour_sequence, cut, gap_mask, tw
 
 LEAST_PIXELS = 64
 """Smallest side of a photo that is looked at."""
-SIDE = (320, 560)
+SIDE = (256, 560)
 """The shorter side is brought into this range of pixels; spacings are reported in pixels of the photo as given."""
 LEAST_LATTICE = 0.15
 """Lattice confidence below which a photo is refused."""
@@ -93,16 +93,18 @@ def analyze_photo(linear: ArrayLike, place: str = "photo") -> PhotoAnalysis:
 def lattice_confidence(features: Features, ranked: list[Hypothesis]) -> float:
     """How surely there is a woven lattice, [0, 1].
 
-    Three things must come together: the crossings make sense as a weave, both yarn frequencies hold over the whole
-    photo, and each quarter of the photo shows the repeat of the others.
+    These must come together: the crossings make sense as a weave, both yarn frequencies hold over the whole photo,
+    each quarter of the photo shows the repeat of the others, and there are enough yarns to tell (four each way).
     """
     if not ranked:
         return 0.0
     best = ranked[0]
     evidence = 1 / (1 + np.exp(-(best.fit.score - 8.0) / 3.0))
     coherence = np.clip(np.sqrt(best.warp.coherence * best.weft.coherence) / 0.7, 0, 1)
-    agreement = np.clip((fold_agreement(features, best) - 0.55) / 0.2, 0, 1)
-    return float(evidence * coherence * agreement)
+    agreement = np.clip((fold_agreement(features, best) - 0.70) / 0.12, 0, 1)
+    h, w = features.luma.shape
+    enough = np.clip((min(abs(best.warp.fx) * w, abs(best.weft.fy) * h) - 2) / 2, 0, 1)
+    return float(evidence * coherence * agreement * enough)
 
 
 def count_confidence(ranked: list[Hypothesis], axis: int) -> float:

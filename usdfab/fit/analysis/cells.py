@@ -68,10 +68,13 @@ def channels(features: Features, blur: float) -> Array:
 
 
 def cell_map(rectified: Array, inside: Bool, offset: tuple[int, int]) -> CellMap:
-    """Cut sampled channels (8, h, w) into cells that start at ``offset`` (v, u)."""
+    """Cut sampled channels (8, h, w) into cells that start at ``offset`` (v, u).
+
+    There is one row and one column of cells less than the map could hold, at every offset.
+    """
     c, h, w = rectified.shape
     oy, ox = offset
-    rows, cols = (h - oy) // SUB, (w - ox) // SUB
+    rows, cols = h // SUB - 1, w // SUB - 1
     block = rectified[:, oy : oy + rows * SUB, ox : ox + cols * SUB].reshape(c, rows, SUB, cols, SUB)
     valid = inside[oy : oy + rows * SUB, ox : ox + cols * SUB].reshape(rows, SUB, cols, SUB).mean((1, 3)) > 0.85
     mean = block.mean((2, 4))

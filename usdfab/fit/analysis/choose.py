@@ -19,13 +19,12 @@ from usdfab.fit.analysis.patterns import PatternFit, best_regular
 from usdfab.fit.analysis.rectify import SUB, Grid, Phase, build_grid, demodulate
 from usdfab.fit.analysis.spectrum import Peak, axis_peaks, pair_prior, power, structure_rotation
 
-PAIRS = 20
+PAIRS = 16
 """Pairs of peaks that are tried."""
-SEMIFINALISTS = 8
+SEMIFINALISTS = 5
 """Pairs for which yarn-dyed colours are allowed."""
-FINALISTS = 4
+FINALISTS = 3
 """Pairs for which irregular repeats are searched as well."""
-LEAST_CELLS = 9
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,8 @@ def _best_on_pair(maps: Array, warp: Phase, weft: Phase, prior: float) -> Hypoth
     h, w = maps.shape[1:]
     grid = build_grid(warp, weft, (h, w))
     offsets = [(oy, ox) for oy in range(0, SUB, 2) for ox in range(0, SUB, 2)]
-    found = _visit(grid.sample(maps), grid, offsets, False)
+    rectified = grid.sample(maps)
+    found = best_regular([cell_map(rectified, grid.inside, offset) for offset in offsets])
     if found is None:
         return None
     fit, cells = found
@@ -128,24 +128,10 @@ def _refined(maps: Array, start: Hypothesis, prior: float) -> Hypothesis:
     best = (start.fit, start.cells)
     offsets = [(oy, ox) for oy in range(0, SUB, 2) for ox in range(0, SUB, 2)]
     for _ in range(2):
-        found = _visit(rectified, start.grid, offsets, True)
+        found = best_regular([cell_map(rectified, start.grid.inside, offset) for offset in offsets], dyed=True)
         if found is not None and found[0].score > best[0].score:
             best = found
         oy, ox = best[1].offset
         offsets = [((oy + dy) % SUB, (ox + dx) % SUB) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     fit, cells = best
     return replace(start, cells=cells, fit=fit, score=fit.score + prior)
-
-
-def _visit(
-    rectified: Array, grid: Grid, offsets: list[tuple[int, int]], dyed: bool
-) -> tuple[PatternFit, CellMap] | None:
-    best: tuple[PatternFit, CellMap] | None = None
-    for offset in offsets:
-        cells = cell_map(rectified, grid.inside, offset)
-        if cells.valid.sum() < LEAST_CELLS:
-            continue
-        fit = best_regular(cells, dyed=dyed)
-        if fit is not None and (best is None or fit.score > best[0].score):
-            best = (fit, cells)
-    return best

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from usdfab.fit.analysis.cells import CHROMA_A, FIBERS, LUMA, ORIENTATION, CellMap
 from usdfab.fit.analysis.features import Array
-from usdfab.fit.analysis.patterns import BIT, PatternFit, fold, gain, pattern_variances
+from usdfab.fit.analysis.patterns import BIT, PatternFit, fold, gain, pattern_variances, triple
 from usdfab.fit.analysis.repeat import Lattice, all_lattices, interlaces
 
 PRIOR = -5.0
@@ -69,5 +69,4 @@ def _ascend(lattice: Lattice, sums: Array, counts: Array) -> PatternFit | None:
     if best is None:
         return None
     score, table, explained = best
-    triple = (float(explained[0]), float(explained[1]), float(explained[2]))
-    return PatternFit(lattice, table, triple, score + PRIOR - BIT * lattice.bits)
+    return PatternFit(lattice, table, triple(explained), score + PRIOR - BIT * lattice.bits)

@@ -20,6 +20,8 @@ from usdfab.fit.analysis.repeat import Lattice
 SAMPLES = 120.0
 """Independent observations that one photo is worth: weighs explained variance against prior."""
 BIT = float(np.log(2.0))
+LEAST_CELLS = 9
+"""Fewest whole crossings from which a weave is read."""
 CHANNEL_WEIGHTS = np.array([1.0, 0.6, 1.0])
 """Orientation, luma profile, colour: the profile tells about yarns more than about the weave."""
 LEAST_TURN = 0.06
@@ -64,7 +66,7 @@ def pattern_prior(width: int, step: int) -> Array:
         if width == 2:
             prior[:] = -BIT * width
         # Three and four shafts are the rule; a long float is rarer on a twill lattice than on a satin lattice.
-        prior[:] -= 3.0 if width > 4 else 0.0
+        prior[:] -= 4.0 if width > 4 else 0.0
         prior[simple & (np.maximum(ones, width - ones) > 4)] -= 3.0
     elif gcd(width, step) == 1 and width >= 5:
         prior[single] = -1.0 - BIT * width
@@ -89,29 +91,34 @@ def _membership(lattice: Lattice, rows: int, cols: int) -> Array:
 
 
 def fold(vectors: Array, valid: NDArray[np.bool_], lattice: Lattice) -> tuple[Array, Array]:
-    """Per class of ``lattice``: sums of the cell vectors (6, N) and counts (N,)."""
-    rows, cols = valid.shape
+    """Per class of ``lattice``: sums of the cell vectors (..., 7, R, K) -> (..., 7, N), and counts (..., N)."""
+    rows, cols = valid.shape[-2:]
     member = _membership(lattice, rows, cols)
-    weight = valid.ravel().astype(float)
-    return (vectors.reshape(len(vectors), -1) * weight) @ member, weight @ member
+    weight = valid.reshape(*valid.shape[:-2], rows * cols).astype(float)
+    flat = vectors.reshape(*vectors.shape[:-2], rows * cols)
+    return (flat * weight[..., None, :]) @ member, weight @ member
 
 
 def pattern_variances(sums: Array, counts: Array, p: NDArray[np.bool_]) -> Array:
-    """(M, 3) explained variance of orientation, luma profile and colour for patterns ``p`` (M, N)."""
-    one = p.astype(float)
-    n1 = one @ counts
-    n0 = counts.sum() - n1
-    m1 = (one @ sums.T) / np.maximum(n1, 1e-9)[:, None]
-    m0 = ((1 - one) @ sums.T) / np.maximum(n0, 1e-9)[:, None]
-    q = n1 / counts.sum()
-    between = (q * (1 - q))[:, None] * (m1 - m0) ** 2
-    signed = np.where(m0 > m1, between, 0.0)
-    orientation = 0.35 * signed[:, ORIENTATION] + 0.65 * signed[:, FIBERS]
-    profile = np.zeros(len(p))
+    """(..., M, 3) explained variance of orientation, luma profile and colour for patterns ``p`` (M, N).
+
+    ``sums`` (..., 7, N) and ``counts`` (..., N) are those of :func:`fold`.
+    """
+    one = p.T.astype(float)
+    total = counts.sum(-1)[..., None]
+    n1 = counts @ one
+    sum1 = sums @ one
+    m1 = sum1 / np.maximum(n1, 1e-9)[..., None, :]
+    m0 = (sums.sum(-1)[..., None] - sum1) / np.maximum(total - n1, 1e-9)[..., None, :]
+    q = n1 / total
+    between = (q * (1 - q))[..., None, :] * (m1 - m0) ** 2
+    turned = np.where(m0 > m1, between, 0.0)
+    orientation = 0.35 * turned[..., ORIENTATION, :] + 0.65 * turned[..., FIBERS, :]
+    profile = np.zeros(q.shape)
     for column in (LUMA_U, LUMA_V):
-        profile += q * np.maximum(m1[:, column], 0) ** 2 + (1 - q) * np.maximum(m0[:, column], 0) ** 2
-    colour = between[:, LUMA] + 0.5 * (between[:, CHROMA_A] + between[:, CHROMA_B])
-    return np.stack([orientation, profile, colour], axis=1)
+        profile += q * np.maximum(m1[..., column, :], 0) ** 2 + (1 - q) * np.maximum(m0[..., column, :], 0) ** 2
+    colour = between[..., LUMA, :] + 0.5 * (between[..., CHROMA_A, :] + between[..., CHROMA_B, :])
+    return np.stack([orientation, profile, colour], axis=-1)
 
 
 def gain(explained: Array) -> Array:
@@ -121,37 +128,40 @@ def gain(explained: Array) -> Array:
     return nats[..., 0] + trust * (nats[..., 1] + nats[..., 2])
 
 
-def best_regular(cells: CellMap, max_width: int = 8, dyed: bool = False) -> PatternFit | None:
-    """The best regular weave on one grid; ``dyed`` also lets every yarn have a colour of its own."""
-    rows, cols = cells.valid.shape
-    out = []
-    for lattice in regular_lattices(max_width):
-        if lattice.width > cols or lattice.width > rows * 2:
+def best_regular(cells: list[CellMap], max_width: int = 8, dyed: bool = False) -> tuple[PatternFit, CellMap] | None:
+    """The best regular weave over several cell offsets of one grid, with the offset it was found at.
+
+    ``dyed`` also lets every yarn have a colour of its own. All offsets must have the same number of cells.
+    """
+    cells = [c for c in cells if c.valid.sum() >= LEAST_CELLS]
+    if not cells:
+        return None
+    vectors, valid = np.stack([c.vectors for c in cells]), np.stack([c.valid for c in cells])
+    rows, cols = valid.shape[1:]
+    best: tuple[PatternFit, CellMap] | None = None
+    for lattice, p, prior in _regular_weaves(max_width):
+        if lattice.width > cols or lattice.shape[0] > 2 * rows:
             continue
-        sums, counts = fold(cells.vectors, cells.valid, lattice)
-        if counts.min() < 1:
-            continue
-        p = patterns(lattice.width)
+        sums, counts = fold(vectors, valid, lattice)
         explained = pattern_variances(sums, counts, p)
-        prior = pattern_prior(lattice.width, lattice.step)
-        if dyed and lattice.width <= 4:
+        if dyed and lattice.bits <= 4:
             likely = prior > -7
-            own = yarn_dyed_variance(cells, p[likely][:, lattice.classes(rows, cols)])
-            explained[likely, 2] = np.maximum(explained[likely, 2], own)
+            matrices = p[likely][:, lattice.classes(rows, cols)]
+            own = np.stack([yarn_dyed_variance(c, matrices) for c in cells])
+            explained[:, likely, 2] = np.maximum(explained[:, likely, 2], own)
         score = gain(explained) + prior
-        k = int(score.argmax())
-        out.append(PatternFit(lattice, p[k], _triple(explained[k]), float(score[k])))
-    for lattice, p in grouped_plain():
-        if lattice.shape[0] > rows or lattice.shape[1] > cols:
-            continue
-        sums, counts = fold(cells.vectors, cells.valid, lattice)
-        if counts.min() < 1:
-            continue
-        explained = pattern_variances(sums, counts, p)
-        score = gain(explained) - 3.0 - BIT * lattice.bits
-        k = int(score.argmax())
-        out.append(PatternFit(lattice, p[k], _triple(explained[k]), float(score[k])))
-    return max(out, key=lambda fit: fit.score, default=None)
+        score[counts.min(1) < 1] = -np.inf
+        b, k = np.unravel_index(int(score.argmax()), score.shape)
+        if np.isfinite(score[b, k]) and (best is None or score[b, k] > best[0].score):
+            best = (PatternFit(lattice, p[k], triple(explained[b, k]), float(score[b, k])), cells[b])
+    return best
+
+
+@lru_cache(maxsize=4)
+def _regular_weaves(max_width: int) -> tuple[tuple[Lattice, NDArray[np.bool_], Array], ...]:
+    """(lattice, patterns, their log prior) of everything :func:`best_regular` tries."""
+    out = [(x, patterns(x.width), pattern_prior(x.width, x.step)) for x in regular_lattices(max_width)]
+    return tuple(out + [(x, p, np.full(len(p), -3.0 - BIT * x.bits)) for x, p in grouped_plain()])
 
 
 @lru_cache(maxsize=1)
@@ -193,5 +203,6 @@ def yarn_dyed_variance(cells: CellMap, weft_up: NDArray[np.bool_]) -> Array:
     return (np.maximum(total - error, 0.0) @ weight) / (total.sum() + valid.sum() * cells.rgb_noise + 1e-12)
 
 
-def _triple(v: Array) -> tuple[float, float, float]:
+def triple(v: Array) -> tuple[float, float, float]:
+    """Three numbers of an array as a tuple."""
     return float(v[0]), float(v[1]), float(v[2])

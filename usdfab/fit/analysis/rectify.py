@@ -95,7 +95,7 @@ def build_grid(warp: Phase, weft: Phase, shape: tuple[int, int], offset: tuple[f
     inverse = np.linalg.inv(m)
     corners = np.array([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]]) @ m.T - np.array(offset)
     low = np.floor(corners.min(0) - 0.25).astype(int)
-    high = np.ceil(corners.max(0) + 0.25).astype(int)
+    high = np.ceil(corners.max(0) + 0.25).astype(int) + 1  # one more, so that every cell offset finds room
     u = (np.arange((high[0] - low[0]) * SUB) + 0.5) / SUB + low[0] + offset[0]
     v = (np.arange((high[1] - low[1]) * SUB) + 0.5) / SUB + low[1] + offset[1]
     uu, vv = np.meshgrid(u, v)

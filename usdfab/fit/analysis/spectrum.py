@@ -62,13 +62,13 @@ def power(features: Features) -> tuple[Array, Array, Array]:
 def axis_peaks(spectrum: tuple[Array, Array, Array], axis: int, size: int, count: int = 8) -> list[Peak]:
     """The strongest peaks near the x axis (``axis`` 0, warp) or the y axis (1, weft) of :func:`power`.
 
-    ``size`` is the image extent in pixels along that axis; frequencies from 2.5 cycles per image to one cycle per 6
+    ``size`` is the image extent in pixels along that axis; frequencies from 2.5 cycles per image to one cycle per 8
     pixels are considered.
     """
     p, fx, fy = spectrum
     gx, gy = np.meshgrid(fx, fy)
     along, across = (gx, gy) if axis == 0 else (gy, gx)
-    allowed = (along * size >= 2.5) & (along <= 1 / 6) & (np.abs(across) * size <= along * size * np.tan(WEDGE) + 0.5)
+    allowed = (along * size >= 2.5) & (along <= 1 / 8) & (np.abs(across) * size <= along * size * np.tan(WEDGE) + 0.5)
     top = (p == ndimage.maximum_filter(p, 5)) & allowed
     iy, ix = np.nonzero(top)
     order = np.argsort(-p[iy, ix])[:count]
