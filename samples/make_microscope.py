@@ -18,13 +18,13 @@ from usdfab.usd.rig import swatch_scene
 
 HERE = Path(__file__).resolve().parent
 SIDE = 4e-3
-PIXELS = 480
-SPP = 96
+PIXELS = 400
+SPP = 160
 
 
 def sample_fabric() -> FabricParameters:
     """A 2/2 twill of 29 ends and 24 picks per cm: petrol warp, sand-coloured weft, both spun with Z twist."""
-    common = {"inclination": 0.75, "roughness_azimuthal": 0.15, "roughness_primary": 0.14}
+    common = {"inclination": 0.75, "roughness_azimuthal": 0.3, "roughness_primary": 0.25}
     warp = YarnParameters(
         count=11.6,
         radius=1.42e-4,
@@ -34,7 +34,7 @@ def sample_fabric() -> FabricParameters:
         twist=0.12,
         irregularity=0.22,
         albedo=(0.1, 0.42, 0.5),
-        roughness_longitudinal=0.42,
+        roughness_longitudinal=0.48,
         **common,
     )
     weft = YarnParameters(
@@ -45,7 +45,7 @@ def sample_fabric() -> FabricParameters:
         crimp=0.75,
         twist=0.1,
         irregularity=0.28,
-        albedo=(0.86, 0.74, 0.5),
+        albedo=(0.7, 0.55, 0.33),
         roughness_longitudinal=0.5,
         **common,
     )

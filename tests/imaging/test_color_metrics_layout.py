@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from usdfab.errors import UsdfabError
 from usdfab.imaging import encoded, grid, linear_to_srgb, luminance, mse, psnr, relmse, side_by_side, srgb_to_linear

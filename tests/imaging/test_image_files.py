@@ -1,19 +1,16 @@
 """Image files: what is written is read back; what is broken is said once, in words."""
 
-import os
 import subprocess
 import sys
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 
 from usdfab.errors import UsdfabError
-from usdfab.imaging import image_file as image_file_module
-from usdfab.imaging import read_image, read_layers, srgb_to_linear, write_image
+from usdfab.imaging import image_file as image_file_module, read_image, read_layers, srgb_to_linear, write_image
 from usdfab.imaging.image_file import _oriented
 
 FEW = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

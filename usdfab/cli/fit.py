@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from usdfab.cli.options import Json, Output, Overwrite, Quiet, Seed, print_json, progress_bar, say
+from usdfab.cli.options import Denoise, Json, Output, Overwrite, Quiet, Seed, print_json, progress_bar, say
 
 if TYPE_CHECKING:
     from usdfab.fit.pipeline import Fit
@@ -22,6 +22,7 @@ def run(
     pixel_size: Annotated[str | None, Parameter(help="Physical size of a pixel, e.g. 7.5um.")] = None,
     report: Annotated[Path | None, Parameter(help="Folder for pictures: photo, swatch, side by side.")] = None,
     report_spp: Annotated[int, Parameter(help="Samples per pixel of the report's swatch.")] = 24,
+    denoise: Denoise = False,
     seed: Seed = 0,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -47,10 +48,13 @@ def run(
     from usdfab.files import checked_output
     from usdfab.fit.pipeline import fit_photo
     from usdfab.fit.report import write_report
+    from usdfab.imaging import check_denoiser
     from usdfab.usd.atomic import USD_SUFFIXES
     from usdfab.usd.fabric_io import write_fabric
 
     checked_output(output, USD_SUFFIXES, overwrite=overwrite)
+    if denoise:
+        check_denoiser()
     if not 0 <= seed < 2**31:
         raise UsdfabError(f"{seed} is not between 0 and 2^31 - 1", place="--seed")
     width = parse_length(size) if size else None
@@ -61,7 +65,9 @@ def run(
     pictures: dict[str, Path] = {}
     if report is not None:
         with progress_bar("rendering the report", quiet=quiet) as update:
-            pictures = write_report(fit, report, spp=report_spp, seed=seed, overwrite=overwrite, progress=update)
+            pictures = write_report(
+                fit, report, spp=report_spp, seed=seed, denoised=denoise, overwrite=overwrite, progress=update
+            )
     if not quiet:
         for warning in fit.warnings:
             say(f"warning: {warning}")

@@ -20,6 +20,9 @@ Json = Annotated[bool, Parameter(name="--json", negative="", help="Print the res
 Seed = Annotated[int, Parameter(help="Fixes every random number.")]
 Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative="", help="No progress and no talk.")]
 Resolution = Annotated[str, Parameter(help="WIDTHxHEIGHT in pixels, or WIDTH alone.")]
+Denoise = Annotated[
+    bool, Parameter(negative="", help="Remove the noise of few samples (biased; needs the denoise extra).")
+]
 Threads = Annotated[int | None, Parameter(help="Threads to use; all by default.")]
 
 JSON_SCHEMA = "usdfab/1"

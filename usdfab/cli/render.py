@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from usdfab.cli.options import (
+    Denoise,
     Json,
     OptionalOutput,
     Overwrite,
@@ -40,6 +41,7 @@ def run(
     max_depth: Annotated[int, Parameter(help="Longest path; 2 is direct light only.")] = 64,
     time_code: Annotated[float | None, Parameter(help="Time code of the stage to render.")] = None,
     aov: Annotated[bool, Parameter(negative="", help="EXR only: also albedo, normal, Z, alpha, variance.")] = False,
+    denoise: Denoise = False,
     seed: Seed = 0,
     threads: Threads = None,
     overwrite: Overwrite = False,
@@ -61,15 +63,17 @@ def run(
     stage:
         A USD file.
     """
+    from usdfab import imaging
     from usdfab.errors import UsdfabError
     from usdfab.files import checked_output
-    from usdfab.imaging import write_image
     from usdfab.imaging.image_output import OUTPUT_SUFFIXES
 
     target = output or Path(stage.stem + ".png")
     checked_output(target, OUTPUT_SUFFIXES, overwrite=overwrite, kind="images")
     if aov and target.suffix.lower() != ".exr":
         raise UsdfabError("only .exr files hold further layers", place="--aov", remedy="write to an .exr file")
+    if denoise:
+        imaging.check_denoiser()
     size = parse_resolution(resolution)
     if not 0 <= seed < 2**63:
         raise UsdfabError(f"{seed} is not between 0 and 2^63 - 1", place="--seed")
@@ -94,7 +98,10 @@ def run(
             "alpha": result.alpha,
             "variance": result.variance,
         }
-    write_image(target, result.pixels, overwrite=overwrite, aovs=aovs)
+    pixels = result.pixels
+    if denoise:
+        pixels = imaging.denoise(pixels, result.albedo, result.normal)
+    imaging.write_image(target, pixels, overwrite=overwrite, aovs=aovs)
     height, width = result.pixels.shape[:2]
     if json:
         print_json(

@@ -109,7 +109,7 @@ def _with_yarn_colors(fabric: FabricParameters, analysis: PhotoAnalysis) -> tupl
         sequence = getattr(analysis, this).colour_sequence
         if len(sequence) < 2:
             continue
-        yarn = replace(fabric.system(this), yarn_albedo=tuple(clipped_color(c) for c in sequence))  # type: ignore[arg-type]
+        yarn = replace(fabric.system(this), yarn_albedo=tuple(clipped_color(c) for c in sequence))
         dyed = replace(fabric, **{this: yarn})  # type: ignore[arg-type]
         picks, ends = dyed.repeat()
         if picks * ends > MAX_REPEAT_CELLS:

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from usdfab.errors import UsdfabError
 from usdfab.fit.pipeline import Fit
-from usdfab.imaging import side_by_side, write_image
+from usdfab.imaging import denoise, side_by_side, write_image
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import swatch_scene
 
@@ -25,12 +25,13 @@ def write_report(
     *,
     spp: int = 24,
     seed: int = 0,
+    denoised: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Path]:
     """Write ``photo.png``, ``swatch.png`` and ``comparison.png`` (photo left, swatch right) into ``folder``.
 
-    The folder is made if it is missing. Returns the paths by name.
+    ``denoised`` cleans the swatch with the denoiser. The folder is made if it is missing. Returns the paths by name.
     """
     target = Path(folder)
     paths = {name: target / f"{name}.png" for name in ("photo", "swatch", "comparison")}
@@ -46,7 +47,8 @@ def write_report(
     photo = resized(fit.photo, HEIGHT)
     scene = swatch_scene(fit.fabric)
     settings = RenderSettings((photo.shape[1], photo.shape[0]), spp=spp, seed=seed)
-    swatch = Tracer(scene).render(scene.cameras[0], settings, progress).pixels
+    render = Tracer(scene).render(scene.cameras[0], settings, progress)
+    swatch = denoise(render.pixels, render.albedo, render.normal) if denoised else render.pixels
     write_image(paths["photo"], photo, overwrite=overwrite)
     write_image(paths["swatch"], swatch, overwrite=overwrite)
     write_image(paths["comparison"], side_by_side([photo, swatch]), overwrite=overwrite)
