@@ -14,7 +14,7 @@ from usdfab._version import __version__
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, Provenance
 from usdfab.fabric.fabric import SIZE_RANGE
-from usdfab.fit.albedo import brightness_curves, with_inverted_albedo
+from usdfab.fit.albedo import LADDER, REFINEMENTS, brightness_curves, with_inverted_albedo
 from usdfab.fit.analysis import PhotoAnalysis, analyze_photo
 from usdfab.fit.priors import fabric_from_analysis
 from usdfab.imaging import read_image
@@ -66,15 +66,18 @@ def fit_photo(
         For a file that is no image, too small, or shows no woven cloth.
     """
     say = progress or (lambda *_: None)
-    say("reading", 0, 5)
+    say("reading", 0, 8)
     image = read_image(path)
     photo = image.pixels
     width, source = _physical_width(photo.shape[1], width, pixel_size, image.pixel_size)
-    say("analysing", 1, 5)
+    say("analysing", 1, 8)
     analysis = analyze_photo(photo.astype(np.float64), str(path))
     fabric, prior_notes = fabric_from_analysis(analysis, width, seed, _prim_name(Path(path).stem))
-    curves = brightness_curves(fabric, seed=seed, progress=lambda done, _: say("measuring albedo", 1 + done, 5))
-    fabric, albedo_notes = with_inverted_albedo(fabric, curves)
+    ladder, steps = len(LADDER), 2 + len(LADDER) + REFINEMENTS
+    curves = brightness_curves(fabric, seed=seed, progress=lambda done, _: say("measuring albedo", 2 + done, steps))
+    fabric, albedo_notes = with_inverted_albedo(
+        fabric, curves, seed=seed, progress=lambda done, _: say("measuring albedo", 2 + ladder + done, steps)
+    )
     warnings = list(analysis.warnings) + list(albedo_notes)
     if source == "default":
         warnings.insert(
@@ -88,7 +91,6 @@ def fit_photo(
         stages=("analysis",),
         notes=tuple(notes),
     )
-    say("done", 5, 5)
     return Fit(replace(fabric, provenance=provenance), analysis, photo, source, tuple(warnings))
 
 
