@@ -7,8 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import NAMED_WEAVES, PRESETS, FabricParameters, YarnParameters, edited, preset, weave_from_name

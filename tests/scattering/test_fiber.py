@@ -6,8 +6,7 @@ import math
 import numpy as np
 import pytest
 import scattering_checks as checks
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scattering_checks import Fiber
 from scipy import special
 

@@ -11,7 +11,6 @@ from usdfab.fibers import Patch
 from usdfab.scattering.roughness import absorption_from_albedo
 from usdfab.usd.scene import Camera, DomeLight, PointLight
 
-
 UNITS = 1e5
 """Mitsuba units per metre. Its rays start 9e-5 (1 + |p|) units off the surface: far too much for fibers in metres."""
 
@@ -34,7 +33,11 @@ def curves_text(patch: Patch, around: int, center: np.ndarray, folder: Path) -> 
         for curve in range(system.curves):
             own = points[offsets[curve] : offsets[curve + 1]]
             for shift in shifts:
-                lines.append("\n".join(f"{x:.9g} {y:.9g} {z:.9g} {UNITS * system.radius:.9g}" for x, y, z in UNITS * (own + shift)))
+                lines.append(
+                    "\n".join(
+                        f"{x:.9g} {y:.9g} {z:.9g} {UNITS * system.radius:.9g}" for x, y, z in UNITS * (own + shift)
+                    )
+                )
         path = folder / f"{system.system}.txt"
         path.write_text("\n\n".join(lines) + "\n")
         files[system.system] = path
@@ -42,7 +45,13 @@ def curves_text(patch: Patch, around: int, center: np.ndarray, folder: Path) -> 
 
 
 def mitsuba_dict(
-    mi, fabric: FabricParameters, files: dict[str, Path], camera: Camera, lights: list, size: tuple[int, int], depth: int
+    mi,
+    fabric: FabricParameters,
+    files: dict[str, Path],
+    camera: Camera,
+    lights: list,
+    size: tuple[int, int],
+    depth: int,
 ) -> dict:
     """A Mitsuba scene dictionary. Yarns need ``roughness_primary == roughness_longitudinal`` and one colour each."""
     scene: dict = {

@@ -11,8 +11,7 @@ pytest.importorskip("pyvista")
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, YarnParameters
 from usdfab.fibers.patch import generate_patch
-from usdfab.view import fiber_scene, render, screenshot, show
-from usdfab.view import inspect as inspect_module
+from usdfab.view import fiber_scene, inspect as inspect_module, render, screenshot, show
 from usdfab.view.inspect import _connectivity, _lines
 
 SMALL = (200, 150)

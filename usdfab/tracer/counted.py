@@ -14,7 +14,7 @@ _B = np.uint64(0x94D049BB133111EB)
 
 
 @njit(cache=True, inline="always")
-def mix(x):  # type: ignore[no-untyped-def]
+def mix(x):
     """The 64-bit finaliser of SplitMix64 (Steele, Lea, Flood 2014)."""
     x = (x ^ (x >> np.uint64(30))) * _A
     x = (x ^ (x >> np.uint64(27))) * _B
@@ -22,13 +22,13 @@ def mix(x):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def start_stream(seed, pixel, sample):  # type: ignore[no-untyped-def]
+def start_stream(seed, pixel, sample):
     """The stream of one sample of one pixel."""
     return mix(mix(mix(np.uint64(seed) + _GOLDEN) + np.uint64(pixel)) + np.uint64(sample) + _GOLDEN)
 
 
 @njit(cache=True, inline="always")
-def next_uniform(stream):  # type: ignore[no-untyped-def]
+def next_uniform(stream):
     """(stream, u): the next number of the stream, in [0, 1)."""
     stream = stream + _GOLDEN
     return stream, np.float64(mix(stream) >> np.uint64(11)) * 2.0**-53

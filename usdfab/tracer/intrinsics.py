@@ -22,11 +22,11 @@ _INVOKE_ARGUMENT_FILTER = np.uint32(2)
 
 
 @intrinsic
-def _call_embree(typingctx, function, scene, ray, arguments):  # type: ignore[no-untyped-def]
+def _call_embree(typingctx, function, scene, ray, arguments):
     """``function(scene, ray, arguments)``, all given as addresses."""
     signature = types.void(types.uint64, types.uint64, types.uint64, types.uint64)
 
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def codegen(context, builder, signature, args):
         pointer = ir.IntType(8).as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [pointer, pointer, pointer])
         callee = builder.inttoptr(args[0], kind.as_pointer())
@@ -37,18 +37,18 @@ def _call_embree(typingctx, function, scene, ray, arguments):  # type: ignore[no
 
 
 @intrinsic
-def _as_pointer(typingctx, address):  # type: ignore[no-untyped-def]
+def _as_pointer(typingctx, address):
     """An address as a void pointer that ``carray`` takes."""
     signature = types.voidptr(types.uint64)
 
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def codegen(context, builder, signature, args):
         return builder.inttoptr(args[0], ir.IntType(8).as_pointer())
 
     return signature, codegen
 
 
 @cfunc(types.void(types.CPointer(types.uint64)), cache=True)
-def reject_back_faces(arguments):  # type: ignore[no-untyped-def]
+def reject_back_faces(arguments):
     """Embree filter: refuse hits on the inside of a fiber.
 
     This build of Embree does not cull back faces of curves. A ray that was transmitted starts on the surface and goes
@@ -70,7 +70,7 @@ def filter_address() -> int:
 
 
 @njit(cache=True, inline="always")
-def new_ray_buffer(filter_function):  # type: ignore[no-untyped-def]
+def new_ray_buffer(filter_function):
     """A ray buffer: (float32 view, uint32 view, address). One for each thread at work."""
     memory = np.zeros(WORDS + 4, dtype=np.float32)
     shift = ((16 - (memory.ctypes.data % 16)) % 16) // 4
@@ -86,7 +86,7 @@ def new_ray_buffer(filter_function):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def intersect(function, scene, buffer, ox, oy, oz, dx, dy, dz, tnear, tfar, arguments):  # type: ignore[no-untyped-def]
+def intersect(function, scene, buffer, ox, oy, oz, dx, dy, dz, tnear, tfar, arguments):
     """Nearest hit along the ray. True on a hit; the hit's fields are in the buffer (TFAR, NG, U, V, PRIM)."""
     f, w, address = buffer
     f[ORG], f[ORG + 1], f[ORG + 2], f[TNEAR] = ox, oy, oz, tnear
@@ -99,7 +99,7 @@ def intersect(function, scene, buffer, ox, oy, oz, dx, dy, dz, tnear, tfar, argu
 
 
 @njit(cache=True, inline="always")
-def occluded(function, scene, buffer, ox, oy, oz, dx, dy, dz, tnear, tfar, arguments):  # type: ignore[no-untyped-def]
+def occluded(function, scene, buffer, ox, oy, oz, dx, dy, dz, tnear, tfar, arguments):
     """Whether anything lies on the ray between tnear and tfar."""
     f, w, address = buffer
     f[ORG], f[ORG + 1], f[ORG + 2], f[TNEAR] = ox, oy, oz, tnear

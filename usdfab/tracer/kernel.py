@@ -92,7 +92,7 @@ class View(NamedTuple):
 
 
 @njit(cache=True)
-def _enter_slab(macro, patches, prim, u, v, dx, dy, dz, t):  # type: ignore[no-untyped-def]
+def _enter_slab(macro, patches, prim, u, v, dx, dy, dz, t):
     """The similarity from world to patch at a hit on a fabric, and where the ray enters the slab.
 
     Returns
@@ -147,7 +147,7 @@ def _enter_slab(macro, patches, prim, u, v, dx, dy, dz, t):  # type: ignore[no-u
 
 
 @njit(cache=True)
-def _step(table, lx, ly, lz, dx, dy, dz):  # type: ignore[no-untyped-def]
+def _step(table, lx, ly, lz, dx, dy, dz):
     """Distance to the border of the tile or slab, and which: 0 x, 1 y, 2 z."""
     t, axis = FAR, 2
     if dz > 0.0:
@@ -167,7 +167,7 @@ def _step(table, lx, ly, lz, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _wrap(table, axis, lx, ly, dx, dy):  # type: ignore[no-untyped-def]
+def _wrap(table, axis, lx, ly, dx, dy):
     """Place at the start of the next tile after crossing a border."""
     if axis == 0:
         lx = 0.0 if dx > 0.0 else table[0]
@@ -177,7 +177,7 @@ def _wrap(table, axis, lx, ly, dx, dy):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _trace_slab(world, buffer, patch, lx, ly, lz, dx, dy, dz):  # type: ignore[no-untyped-def]
+def _trace_slab(world, buffer, patch, lx, ly, lz, dx, dy, dz):
     """Nearest fiber along a ray in patch space.
 
     Returns (outcome, distance, place in its tile (3)); on ``HIT`` the hit's other fields are in the buffer.
@@ -201,7 +201,7 @@ def _trace_slab(world, buffer, patch, lx, ly, lz, dx, dy, dz):  # type: ignore[n
 
 
 @njit(cache=True)
-def _slab_occluded(world, buffer, patch, lx, ly, lz, dx, dy, dz, tmax):  # type: ignore[no-untyped-def]
+def _slab_occluded(world, buffer, patch, lx, ly, lz, dx, dy, dz, tmax):
     """Whether a fiber lies on a ray in patch space before it leaves the slab: (occluded, distance to the exit)."""
     table = world.patches.table[patch]
     total, near = 0.0, table[4]
@@ -224,7 +224,7 @@ def _slab_occluded(world, buffer, patch, lx, ly, lz, dx, dy, dz, tmax):  # type:
 
 
 @njit(cache=True)
-def _leave_slab(table, scale, across):  # type: ignore[no-untyped-def]
+def _leave_slab(table, scale, across):
     """World distance by which a ray that leaves a slab steps back along itself, to about the mid-surface.
 
     Meshes that lie within the cloth's thickness (the body under a garment) are then met, and the cloth's own mesh is
@@ -238,7 +238,7 @@ def _leave_slab(table, scale, across):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _trace_macro(world, buffer, ox, oy, oz, dx, dy, dz, near, tmax, skip_mesh, skip_distance):  # type: ignore[no-untyped-def]
+def _trace_macro(world, buffer, ox, oy, oz, dx, dy, dz, near, tmax, skip_mesh, skip_distance):
     """Nearest triangle, those of ``skip_mesh`` nearer than ``skip_distance`` left out: (hit, t, prim, u, v)."""
     for _ in range(MAX_SURFACES):
         if not intersect(world.embree[0], world.embree[3], buffer, ox, oy, oz, dx, dy, dz, near, tmax, ARGS_PLAIN):
@@ -253,7 +253,7 @@ def _trace_macro(world, buffer, ox, oy, oz, dx, dy, dz, near, tmax, skip_mesh, s
 
 
 @njit(cache=True)
-def _macro_visible(world, buffer, ox, oy, oz, dx, dy, dz, near, tmax, skip_mesh, skip_distance):  # type: ignore[no-untyped-def]
+def _macro_visible(world, buffer, ox, oy, oz, dx, dy, dz, near, tmax, skip_mesh, skip_distance):
     """Whether light comes through from ``tmax``: surfaces block it, fabrics where a fiber is in the way."""
     for _ in range(MAX_SURFACES):
         hit, t, prim, u, v = _trace_macro(world, buffer, ox, oy, oz, dx, dy, dz, near, tmax, skip_mesh, skip_distance)
@@ -284,7 +284,7 @@ def _macro_visible(world, buffer, ox, oy, oz, dx, dy, dz, near, tmax, skip_mesh,
 
 
 @njit(cache=True)
-def _lambert_sample(nx, ny, nz, u0, u1):  # type: ignore[no-untyped-def]
+def _lambert_sample(nx, ny, nz, u0, u1):
     """A cosine-distributed direction about a unit normal."""
     radius, phi = math.sqrt(u0), 2.0 * math.pi * u1
     a, b, c = radius * math.cos(phi), radius * math.sin(phi), math.sqrt(max(0.0, 1.0 - u0))
@@ -298,7 +298,7 @@ def _lambert_sample(nx, ny, nz, u0, u1):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _trace_path(world, buffer, stream, ox, oy, oz, dx, dy, dz, max_depth, out):  # type: ignore[no-untyped-def]
+def _trace_path(world, buffer, stream, ox, oy, oz, dx, dy, dz, max_depth, out):
     """Radiance along a camera ray. Adds to ``out``: RGB, albedo (3), normal (3), depth, alpha, rays traced."""
     macro, patches, lights = world.macro, world.patches, world.lights
     light_count = len(lights.table)
@@ -446,8 +446,9 @@ def _trace_path(world, buffer, stream, ox, oy, oz, dx, dy, dz, max_depth, out): 
                     qx = qy = qz = 0.0
                 weight = 1.0 if light_pdf == 0.0 else light_pdf / (light_pdf + pdf)
                 cr, cg, cb = beta_r * fr * lr * weight, beta_g * fg * lg * weight, beta_b * fb * lb * weight
-                if cr + cg + cb > 0.0:
-                    reach = distance * (1.0 - 1e-6)
+                reach = distance * (1.0 - 1e-6)
+                # Area lights stand in each other's way, as they do for rays that the BSDF draws.
+                if cr + cg + cb > 0.0 and hit_light(lights, ox, oy, oz, wx, wy, wz, reach, -1.0)[0] >= reach:
                     out[11] += 1.0
                     if fiber:
                         blocked, through = _slab_occluded(world, buffer, patch, lx, ly, lz, qx, qy, qz, reach * scale)
@@ -500,7 +501,7 @@ CHANNELS = 12
 
 
 @njit(cache=True, nogil=True)
-def render_rows(world, view, seed, rows, first_sample, samples, max_depth, film, squares):  # type: ignore[no-untyped-def]
+def render_rows(world, view, seed, rows, first_sample, samples, max_depth, film, squares):
     """Add samples to the pixels of ``rows`` (first, last + 1) of ``film`` (H, W, CHANNELS), squares to ``squares``.
 
     Runs without Python's lock, so that threads can share the work; a pixel belongs to one call at a time and its

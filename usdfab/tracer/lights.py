@@ -48,6 +48,7 @@ def pack_lights(scene: Scene, textures: dict[str, NDArray[np.float32]], center: 
     power = np.zeros(len(scene.lights))
     image = np.zeros((1, 1, 3))
     rows, columns = np.zeros(2), np.zeros((1, 2))
+    textured = False
     for row, (light, record) in enumerate(zip(scene.lights, table, strict=True)):
         if isinstance(light, PointLight):
             record[0], record[2:5], record[5:8] = POINT, light.intensity, light.position
@@ -72,10 +73,11 @@ def pack_lights(scene: Scene, textures: dict[str, NDArray[np.float32]], center: 
             record[0], record[2:5] = DOME, light.radiance
             record[5:14] = np.linalg.inv(light.to_world[:3, :3]).ravel()
             power[row] = math.pi * np.max(light.radiance)
-            if light.texture_path:
-                if image.size > 3:
+            if light.texture is not None or light.texture_path:
+                if textured:
                     raise UsdfabError("a second dome light with a texture", place=light.path, remedy="keep one of them")
-                image = np.asarray(textures[light.texture_path], dtype=float)
+                textured = True
+                image = _texture(light, textures)
                 record[14] = 1.0
                 rows, columns = image_distribution(image)
                 power[row] *= image.mean()
@@ -83,6 +85,13 @@ def pack_lights(scene: Scene, textures: dict[str, NDArray[np.float32]], center: 
     if len(table):
         table[:, 1] = power / total if total > 0 else 1.0 / len(table)
     return Lights(table, image, rows, columns)
+
+
+def _texture(light: DomeLight, textures: dict[str, NDArray[np.float32]]) -> NDArray[np.float64]:
+    if light.texture is None and light.texture_path not in textures:
+        raise UsdfabError(f"the texture {light.texture_path} was not loaded", place=light.path)
+    image = np.asarray(textures[light.texture_path] if light.texture is None else light.texture, dtype=float)
+    return np.ascontiguousarray(image)
 
 
 def _distance2(position: NDArray, center: NDArray, extent: float) -> float:
@@ -102,7 +111,7 @@ def image_distribution(image: NDArray) -> tuple[NDArray, NDArray]:
 
 
 @njit(cache=True)
-def _texel(cdf, u):  # type: ignore[no-untyped-def]
+def _texel(cdf, u):
     """Index and place within it for a uniform number."""
     k = min(max(np.searchsorted(cdf, u, side="right") - 1, 0), len(cdf) - 2)
     width = cdf[k + 1] - cdf[k]
@@ -110,7 +119,7 @@ def _texel(cdf, u):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _frame(x, y, z):  # type: ignore[no-untyped-def]
+def _frame(x, y, z):
     """Two unit vectors orthogonal to a unit vector (Duff et al. 2017)."""
     sign = math.copysign(1.0, z)
     a = -1.0 / (sign + z)
@@ -119,7 +128,7 @@ def _frame(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _dome_uv(light, x, y, z):  # type: ignore[no-untyped-def]
+def _dome_uv(light, x, y, z):
     """Texture coordinates in [0, 1]: u around the pole, v from the top, and the sine of the polar angle."""
     lx = light[5] * x + light[6] * y + light[7] * z
     ly = light[8] * x + light[9] * y + light[10] * z
@@ -131,7 +140,7 @@ def _dome_uv(light, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _dome_value(lights, light, x, y, z):  # type: ignore[no-untyped-def]
+def _dome_value(lights, light, x, y, z):
     """Radiance from a direction and the solid-angle density with which ``sample_light`` draws it (choice excluded)."""
     if light[14] == 0.0:
         return light[2], light[3], light[4], 0.25 / math.pi
@@ -145,7 +154,7 @@ def _dome_value(lights, light, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def sample_light(lights, px, py, pz, u0, u1, u2):  # type: ignore[no-untyped-def]
+def sample_light(lights, px, py, pz, u0, u1, u2):
     """Choose a light and a place on it, seen from a point.
 
     Returns
@@ -240,13 +249,13 @@ def sample_light(lights, px, py, pz, u0, u1, u2):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, inline="always")
-def _mis(bsdf_pdf, light_pdf):  # type: ignore[no-untyped-def]
+def _mis(bsdf_pdf, light_pdf):
     """Balance heuristic for a direction that the BSDF drew; a negative density stands for a camera ray."""
     return 1.0 if bsdf_pdf < 0.0 else bsdf_pdf / (bsdf_pdf + light_pdf)
 
 
 @njit(cache=True)
-def escaped_radiance(lights, x, y, z, bsdf_pdf):  # type: ignore[no-untyped-def]
+def escaped_radiance(lights, x, y, z, bsdf_pdf):
     """Weighted radiance from domes and distant lights for a ray that left the scene."""
     r = g = b = 0.0
     for k in range(len(lights.table)):
@@ -266,7 +275,7 @@ def escaped_radiance(lights, x, y, z, bsdf_pdf):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def hit_light(lights, ox, oy, oz, dx, dy, dz, tmax, bsdf_pdf):  # type: ignore[no-untyped-def]
+def hit_light(lights, ox, oy, oz, dx, dy, dz, tmax, bsdf_pdf):
     """Nearest area light along a ray: (t, r, g, b) with weighted radiance; t = tmax and black where there is none."""
     best, r, g, b = tmax, 0.0, 0.0, 0.0
     for k in range(len(lights.table)):
@@ -297,8 +306,12 @@ def hit_light(lights, ox, oy, oz, dx, dy, dz, tmax, bsdf_pdf):  # type: ignore[n
             x, y, z = t * dx - x, t * dy - y, t * dz - z
             uu = light[9] ** 2 + light[10] ** 2 + light[11] ** 2
             vv = light[12] ** 2 + light[13] ** 2 + light[14] ** 2
-            u = (x * light[9] + y * light[10] + z * light[11]) / uu
-            v = (x * light[12] + y * light[13] + z * light[14]) / vv
+            uv = light[9] * light[12] + light[10] * light[13] + light[11] * light[14]
+            along_u = x * light[9] + y * light[10] + z * light[11]
+            along_v = x * light[12] + y * light[13] + z * light[14]
+            determinant = uu * vv - uv * uv  # the edges need not be at right angles
+            u = (along_u * vv - along_v * uv) / determinant
+            v = (along_v * uu - along_u * uv) / determinant
             if u < 0.0 or u > 1.0 or v < 0.0 or v > 1.0:
                 continue
             if cos <= 0.0:  # its dark back: opaque

@@ -15,6 +15,7 @@ Notation: ``o``, ``d`` start and direction of a ray, ``beta`` throughput, ``wi``
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -43,11 +44,13 @@ _POINT, _DISTANT, _RECT, _DOME = 0, 1, 2, 3
 
 
 class Fibers(NamedTuple):
-    """Cylinders of one patch, arrays over S segments: ends ``a``, ``b`` and unit tangents there (S, 3), ``radius``,
-    row of ``materials``. ``low``, ``high`` (3,) bound them; the patch repeats with period ``size`` (2,)."""
+    """Cylinders of one patch, arrays over S segments: start ``a`` and unit ``axis`` (S, 3), ``length``, the spline's
+    unit tangents at both ends (S, 3), ``radius``, row of ``materials``. ``low`` and ``high`` (3,) bound them; the patch
+    repeats with period ``size`` (2,)."""
 
     a: NDArray[np.float64]
-    b: NDArray[np.float64]
+    axis: NDArray[np.float64]
+    length: NDArray[np.float64]
     tangent_a: NDArray[np.float64]
     tangent_b: NDArray[np.float64]
     radius: NDArray[np.float64]
@@ -67,7 +70,7 @@ def reference_fibers(fabric: FabricParameters, patch: Patch | None = None) -> Fi
         yarn = fabric.system(system.system)
         points, tangents, offsets = spline_vertices(system)
         # One vertex before each curve and three after it serve the fast tracer; a curve's own n segments follow.
-        own = np.concatenate([np.arange(first + 1, last - 3) for first, last in zip(offsets, offsets[1:], strict=False)])
+        own = np.concatenate([np.arange(first + 1, last - 3) for first, last in pairwise(offsets)])
         curve = np.repeat(np.arange(system.curves), np.diff(offsets) - 4)
         parts = (points[own], points[own + 1], tangents[own], tangents[own + 1], np.full(len(own), system.radius))
         for column, part in zip(columns, (*parts, curve + len(materials)), strict=True):
@@ -78,64 +81,86 @@ def reference_fibers(fabric: FabricParameters, patch: Patch | None = None) -> Fi
     a, b, tangent_a, tangent_b, radius, material = (np.concatenate(c) for c in columns)
     low = np.minimum(a, b).min(axis=0) - radius.max()
     high = np.maximum(a, b).max(axis=0) + radius.max()
-    size = np.asarray(patch.size)
-    return Fibers(a, b, tangent_a, tangent_b, radius, material, np.stack(materials), low, high, size)
+    length = np.linalg.norm(b - a, axis=1)
+    axis, size = (b - a) / length[:, None], np.asarray(patch.size)
+    return Fibers(a, axis, length, tangent_a, tangent_b, radius, material, np.stack(materials), low, high, size)
 
 
 @njit(cache=True)
-def _dot(a, b):  # type: ignore[no-untyped-def]
+def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(cache=True)
-def _hit_segment(fibers, k, o, d):  # type: ignore[no-untyped-def]
-    """Distance at which a ray enters cylinder k from outside, and the place along it in [0, 1]; inf if it does not."""
-    a, b = fibers.a[k], fibers.b[k]
-    length = math.sqrt(_dot(b - a, b - a))
-    axis = (b - a) / length
+def _plus(a, s, b):
+    """a + s b; vectors are tuples where every segment comes by, which costs no memory."""
+    return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
+
+
+@njit(cache=True)
+def _hit_segment(a, axis, length, tangent_a, tangent_b, radius, o, d):
+    """Distance at which a ray enters a cylinder from outside, and the place along it in [0, 1]; inf if it does not."""
     # |o + t d - a| across the axis equals the radius: a quadratic equation in t, whose smaller root is the way in.
-    m = o - a
-    d_across, m_across = d - _dot(d, axis) * axis, m - _dot(m, axis) * axis
+    m = _plus(o, -1.0, a)
+    d_across, m_across = _plus(d, -_dot(d, axis), axis), _plus(m, -_dot(m, axis), axis)
     qa, qb = _dot(d_across, d_across), _dot(d_across, m_across)
-    root = qb * qb - qa * (_dot(m_across, m_across) - fibers.radius[k] ** 2)
+    root = qb * qb - qa * (_dot(m_across, m_across) - radius * radius)
     if qa <= 0.0 or root < 0.0:
         return math.inf, 0.0
     t = (-qb - math.sqrt(root)) / qa
-    place = m + t * d
-    if _dot(place, fibers.tangent_a[k]) < 0.0 or _dot(place + a - b, fibers.tangent_b[k]) >= 0.0:
+    place = _plus(m, t, d)
+    if _dot(place, tangent_a) < 0.0 or _dot(_plus(place, -length, axis), tangent_b) >= 0.0:
         return math.inf, 0.0
     return t, min(max(_dot(place, axis) / length, 0.0), 1.0)
 
 
 @njit(cache=True)
-def trace(fibers, o, d):  # type: ignore[no-untyped-def]
+def _row(x, k):
+    return x[k, 0], x[k, 1], x[k, 2]
+
+
+@njit(cache=True)
+def trace(fibers, origin, direction):
     """Nearest fiber along a ray: (distance or inf, segment, place along it, shift of its copy of the patch).
 
     Every copy of the patch is tried that the ray can touch between the cloth's lowest and highest place.
     """
+    o, d = (origin[0], origin[1], origin[2]), (direction[0], direction[1], direction[2])
     best, segment, along, shift = math.inf, -1, 0.0, np.zeros(3)
     if abs(d[2]) < 1e-9:
         return best, segment, along, shift
     t0, t1 = (fibers.low[2] - o[2]) / d[2], (fibers.high[2] - o[2]) / d[2]
-    start, end = o + max(min(t0, t1), 0.0) * d, o + max(t0, t1) * d
-    if max(t0, t1) <= 0.0:
-        return best, segment, along, shift
-    copies = np.zeros((2, 2), dtype=np.int64)
-    for x in range(2):
-        copies[x, 0] = math.floor((min(start[x], end[x]) - fibers.high[x]) / fibers.size[x])
-        copies[x, 1] = math.ceil((max(start[x], end[x]) - fibers.low[x]) / fibers.size[x])
-    for i in range(copies[0, 0], copies[0, 1] + 1):
-        for j in range(copies[1, 0], copies[1, 1] + 1):
-            moved = np.array([i * fibers.size[0], j * fibers.size[1], 0.0])
+    start, end = max(min(t0, t1), 0.0), max(t0, t1)
+    x0, x1 = min(o[0] + start * d[0], o[0] + end * d[0]), max(o[0] + start * d[0], o[0] + end * d[0])
+    first = math.ceil((x0 - fibers.high[0]) / fibers.size[0])
+    last = math.floor((x1 - fibers.low[0]) / fibers.size[0])
+    for n in range(last - first + 1 if end > 0.0 else 0):
+        # A column of copies, the nearest first, and the part [t0, t1] of the ray that is above or below it.
+        i = first + n if d[0] > 0.0 else last - n
+        t0, t1 = start, end
+        if d[0] != 0.0:
+            ta = (fibers.low[0] + i * fibers.size[0] - o[0]) / d[0]
+            tb = (fibers.high[0] + i * fibers.size[0] - o[0]) / d[0]
+            t0, t1 = max(min(ta, tb), start), min(max(ta, tb), end)
+        if t0 > best:
+            break
+        y0, y1 = min(o[1] + t0 * d[1], o[1] + t1 * d[1]), max(o[1] + t0 * d[1], o[1] + t1 * d[1])
+        lower = math.ceil((y0 - fibers.high[1]) / fibers.size[1])
+        upper = math.floor((y1 - fibers.low[1]) / fibers.size[1])
+        for j in range(lower, upper + 1):
+            moved = (i * fibers.size[0], j * fibers.size[1], 0.0)
+            from_here = _plus(o, -1.0, moved)
             for k in range(len(fibers.a)):
-                t, place = _hit_segment(fibers, k, o - moved, d)
+                ends = _row(fibers.tangent_a, k), _row(fibers.tangent_b, k)
+                a, axis = _row(fibers.a, k), _row(fibers.axis, k)
+                t, place = _hit_segment(a, axis, fibers.length[k], *ends, fibers.radius[k], from_here, d)
                 if _EPSILON * fibers.radius[k] < t < best:
-                    best, segment, along, shift = t, k, place, moved
+                    best, segment, along, shift = t, k, place, np.array(moved)
     return best, segment, along, shift
 
 
 @njit(cache=True)
-def _sample_light(light, o):  # type: ignore[no-untyped-def]
+def _sample_light(rng, light, o):
     """Direction to a place on the light, its distance, and radiance over density (or what stands for it)."""
     kind, color = int(light[0]), light[1:4]
     if kind == _POINT:
@@ -145,20 +170,20 @@ def _sample_light(light, o):  # type: ignore[no-untyped-def]
     if kind == _DISTANT:
         return -light[4:7], math.inf, color
     if kind == _RECT:
-        way = light[4:7] + np.random.random() * light[7:10] + np.random.random() * light[10:13] - o
+        way = light[4:7] + rng.random() * light[7:10] + rng.random() * light[10:13] - o
         distance = math.sqrt(_dot(way, way))
         wi = way / distance
         area = np.cross(light[7:10], light[10:13])
         cosine = max(-_dot(wi, light[13:16]), 0.0)
         return wi, distance, color * cosine * math.sqrt(_dot(area, area)) / distance**2
     # A dome of one colour: all directions alike.
-    z, phi = 2.0 * np.random.random() - 1.0, 2.0 * math.pi * np.random.random()
+    z, phi = 2.0 * rng.random() - 1.0, 2.0 * math.pi * rng.random()
     sine = math.sqrt(1.0 - z * z)
     return np.array([sine * math.cos(phi), sine * math.sin(phi), z]), math.inf, 4.0 * math.pi * color
 
 
 @njit(cache=True)
-def _radiance(fibers, lights, o, d, max_depth):  # type: ignore[no-untyped-def]
+def _radiance(rng, fibers, lights, o, d, max_depth):
     """One sample of the radiance that comes along a ray, against ``d``."""
     radiance, beta = np.zeros(3), np.ones(3)
     for depth in range(1, max_depth + 1):
@@ -175,7 +200,7 @@ def _radiance(fibers, lights, o, d, max_depth):  # type: ignore[no-untyped-def]
         o = o + t * d
         axis = (1.0 - s) * fibers.tangent_a[k] + s * fibers.tangent_b[k]
         axis /= math.sqrt(_dot(axis, axis))
-        normal = o - shift - (fibers.a[k] + s * (fibers.b[k] - fibers.a[k]))
+        normal = o - shift - (fibers.a[k] + s * fibers.length[k] * fibers.axis[k])
         normal -= _dot(normal, axis) * axis
         normal /= math.sqrt(_dot(normal, normal))
         ax, ay, az = axis
@@ -186,14 +211,14 @@ def _radiance(fibers, lights, o, d, max_depth):  # type: ignore[no-untyped-def]
 
         # Direct light from every light.
         for light in lights:
-            wi, distance, emitted = _sample_light(light, o)
+            wi, distance, emitted = _sample_light(rng, light, o)
             sin_ti, cos_ti, phi = fiber_angles(ax, ay, az, ex, ey, ez, fx, fy, fz, wi[0], wi[1], wi[2])
             red, green, blue, _pdf = eval_fiber(material, prepared, sin_ti, cos_ti, phi)
-            if trace(fibers, o, wi)[0] > distance * (1.0 - 1e-9):
+            if trace(fibers, o, wi)[0] >= distance:  # infinity for light from infinity that meets nothing
                 radiance += beta * np.array([red, green, blue]) * emitted
 
         # Onward in a direction that the BSDF draws.
-        u0, u1, u2, u3 = np.random.random(), np.random.random(), np.random.random(), np.random.random()
+        u0, u1, u2, u3 = rng.random(), rng.random(), rng.random(), rng.random()
         sin_ti, cos_ti, phi, red, green, blue, pdf = sample_fiber(material, prepared, u0, u1, u2, u3)
         if pdf <= 0.0:
             break
@@ -204,19 +229,20 @@ def _radiance(fibers, lights, o, d, max_depth):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _render(fibers, lights, to_world, film, origin, width, height, spp, max_depth, seed):  # type: ignore[no-untyped-def]
-    np.random.seed(seed)
+def _render(rng, fibers, lights, to_world, film, origin, width, height, spp, max_depth):
     mean, squares = np.zeros((height, width, 3)), np.zeros((height, width, 3))
     start = to_world[:3, 3] + origin
     for row in range(height):
         for column in range(width):
             for _ in range(spp):
-                s = 2.0 * (column + np.random.random()) / width - 1.0
-                t = 1.0 - 2.0 * (row + np.random.random()) / height
+                s = 2.0 * (column + rng.random()) / width - 1.0
+                t = 1.0 - 2.0 * (row + rng.random()) / height
                 d = np.array([film[0] * (s + film[2]), film[1] * (t + film[3]), -1.0])
                 d /= math.sqrt(_dot(d, d))
                 x, y, z = to_world[0, :3], to_world[1, :3], to_world[2, :3]
-                sample = _radiance(fibers, lights, start, np.array([_dot(x, d), _dot(y, d), _dot(z, d)]), max_depth)
+                sample = _radiance(
+                    rng, fibers, lights, start, np.array([_dot(x, d), _dot(y, d), _dot(z, d)]), max_depth
+                )
                 mean[row, column] += sample / spp
                 squares[row, column] += sample**2 / spp
     return mean, (squares - mean**2) / max(spp - 1, 1)
@@ -253,7 +279,9 @@ def render_reference(
     packed = np.stack([_pack(light, shift) for light in lights])
     film = np.r_[camera.tan_half, camera.offset]
     to_world = np.ascontiguousarray(camera.to_world, dtype=float)
-    mean, variance = _render(fibers, packed, to_world, film, shift, *resolution, spp, max_depth, seed)
+    mean, variance = _render(
+        np.random.default_rng(seed), fibers, packed, to_world, film, shift, *resolution, spp, max_depth
+    )
     return mean, variance
 
 
