@@ -28,6 +28,9 @@ CLOTH = FabricParameters(
 )
 
 
+FEW = 5_000
+"""Paths for albedos where a test is not about them."""
+
 DRAWN = Cloth(weave_from_name("plain").matrix, 8, 8, size=240)
 
 
@@ -131,17 +134,17 @@ def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_size_comes_from_the_option_the_tags_or_the_default(photo: Path, tmp_path: Path) -> None:
-    by_size = fit_photo(photo, width=3e-3)
+    by_size = fit_photo(photo, width=3e-3, albedo_paths=FEW)
     assert by_size.fabric.size[0] == pytest.approx(3e-3)
     assert by_size.fabric.provenance.source_sha256 == hashlib.sha256(photo.read_bytes()).hexdigest()
     assert by_size.fabric.name == "MyCloth1"
-    assert fit_photo(photo, pixel_size=1e-5).fabric.size[0] == pytest.approx(2.4e-3)
-    default = fit_photo(photo)
+    assert fit_photo(photo, pixel_size=1e-5, albedo_paths=FEW).fabric.size[0] == pytest.approx(2.4e-3)
+    default = fit_photo(photo, albedo_paths=FEW)
     assert default.fabric.size[0] == pytest.approx(DEFAULT_WIDTH)
     assert any("--size" in warning for warning in default.warnings)
     tagged = tmp_path / "tagged.tif"
     write_image(tagged, draw(DRAWN), pixel_size=(8e-6, 8e-6))
-    assert fit_photo(tagged).fabric.size[0] == pytest.approx(240 * 8e-6, rel=0.01)
+    assert fit_photo(tagged, albedo_paths=FEW).fabric.size[0] == pytest.approx(240 * 8e-6, rel=0.01)
 
 
 def test_contradictions_about_size_are_refused(photo: Path) -> None:

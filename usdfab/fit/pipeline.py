@@ -14,7 +14,7 @@ from usdfab._version import __version__
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, Provenance
 from usdfab.fabric.fabric import SIZE_RANGE
-from usdfab.fit.albedo import LADDER, REFINEMENTS, brightness_curves, with_inverted_albedo
+from usdfab.fit.albedo import LADDER, PATHS, REFINEMENTS, brightness_curves, with_inverted_albedo
 from usdfab.fit.analysis import PhotoAnalysis, analyze_photo
 from usdfab.fit.priors import fabric_from_analysis
 from usdfab.imaging import read_image
@@ -47,6 +47,7 @@ def fit_photo(
     pixel_size: float | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    albedo_paths: int = PATHS,
 ) -> Fit:
     """Estimate a fabric from one photo.
 
@@ -59,6 +60,8 @@ def fit_photo(
         count; without those, ``DEFAULT_WIDTH``, with a warning.
     seed:
         Fixes the fabric's random draws and those of the renders made on the way.
+    albedo_paths:
+        Paths in each render by which albedos are found; fewer are faster and noisier.
 
     Raises
     ------
@@ -74,9 +77,15 @@ def fit_photo(
     analysis = analyze_photo(photo.astype(np.float64), str(path))
     fabric, prior_notes = fabric_from_analysis(analysis, width, seed, _prim_name(Path(path).stem))
     ladder, steps = len(LADDER), 2 + len(LADDER) + REFINEMENTS
-    curves = brightness_curves(fabric, seed=seed, progress=lambda done, _: say("measuring albedo", 2 + done, steps))
+    curves = brightness_curves(
+        fabric, albedo_paths, seed=seed, progress=lambda done, _: say("measuring albedo", 2 + done, steps)
+    )
     fabric, albedo_notes = with_inverted_albedo(
-        fabric, curves, seed=seed, progress=lambda done, _: say("measuring albedo", 2 + ladder + done, steps)
+        fabric,
+        curves,
+        albedo_paths,
+        seed=seed,
+        progress=lambda done, _: say("measuring albedo", 2 + ladder + done, steps),
     )
     warnings = list(analysis.warnings) + list(albedo_notes)
     if source == "default":
