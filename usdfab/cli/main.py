@@ -50,6 +50,7 @@ def make_app(chosen: str = "") -> App:
         help=HELP,
         help_format="markdown",
         result_action="return_value",
+        suppress_keyboard_interrupt=False,  # _run says it and sets the exit code
     )
     for name, line in COMMANDS.items():
         if name == chosen:
