@@ -181,7 +181,7 @@ def test_inspect_draws_a_picture_without_a_display(small: Path, tmp_path: Path) 
     done = usdfab(
         "inspect", small, "--screenshot", out, "--resolution", "160x120", "--tiles", "1x1", "--color", "fiber"
     )
-    if "OpenGL" in done.stderr:
+    if done.returncode == 2 and "VTK finds no OpenGL" in done.stderr:  # the machine's lack, said as it should be
         pytest.skip(done.stderr.strip())
     assert done.returncode == 0, done.stderr
     assert len(np.unique(read_image(out).pixels.reshape(-1, 3), axis=0)) > 50

@@ -29,9 +29,9 @@ def opengl():
     probe = "from usdfab.view.gl import check_off_screen; check_off_screen(); import pyvista as p; "
     probe += "q = p.Plotter(off_screen=True); q.add_mesh(p.Sphere()); q.screenshot(return_img=True)"
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, timeout=120)
-    if done.returncode:
-        reason = done.stderr.strip().splitlines()
-        pytest.skip(f"VTK cannot draw here: {reason[-1] if reason else done.returncode}")
+    if "VTK finds no OpenGL" in done.stderr:
+        pytest.skip(done.stderr.strip().splitlines()[-1])
+    assert done.returncode == 0, done.stderr  # anything else is a fault of ours, not of the machine
 
 
 def test_tubes_have_the_fibers_radius_and_place(patch):
