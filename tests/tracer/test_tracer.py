@@ -13,7 +13,8 @@ from scenes import cloth_material, dome, fabric, lambert, look, plane, swatch
 from usdfab.errors import UsdfabError
 from usdfab.fibers import generate_patch
 from usdfab.tracer import RenderSettings, Tracer
-from usdfab.tracer.kernel import CHANNELS, View, render_rows
+from usdfab.tracer.film import CHANNELS
+from usdfab.tracer.kernel import View, render_tile
 from usdfab.tracer.patch_scene import tile_copies
 from usdfab.tracer.reference import reference_fibers, trace
 from usdfab.usd.scene import DistantLight, PointLight, RectLight, SphereLight
@@ -211,7 +212,7 @@ def test_passes_do_not_show(sample):
     assert len(seen) > 2 and seen[-1][0] == seen[-1][1] and seen == sorted(seen)
     view = View(camera.to_world[:3, :4].copy(), np.r_[camera.tan_half, camera.offset], 16, 16)
     film, squares = np.zeros((16, 16, CHANNELS)), np.zeros((16, 16, 3))
-    render_rows(tracer.world, view, np.uint64(3), (0, 16), 0, 11, 64, film, squares)
+    render_tile(tracer.world, view, np.uint64(3), (0, 0, 16, 16), 0, 11, 64, film, squares)
     np.testing.assert_array_equal(render.pixels, (film[..., :3] / 11).astype(np.float32))
 
 

@@ -29,6 +29,7 @@ from usdfab.scattering.fiber_numba import (
     sample_fiber,
 )
 from usdfab.tracer.counted import mix, next_uniform, start_stream
+from usdfab.tracer.film import SAMPLES
 from usdfab.tracer.intrinsics import (
     ARGS_FILTER,
     ARGS_PLAIN,
@@ -496,28 +497,34 @@ def _trace_path(world, buffer, stream, ox, oy, oz, dx, dy, dz, max_depth, out):
     return total_r, total_g, total_b
 
 
-CHANNELS = 12
-"""Of the film: RGB, albedo (3), normal (3), depth, alpha, rays."""
-
-
 @njit(cache=True, nogil=True)
-def render_rows(world, view, seed, rows, first_sample, samples, max_depth, film, squares):
-    """Add samples to the pixels of ``rows`` (first, last + 1) of ``film`` (H, W, CHANNELS), squares to ``squares``.
+def render_tile(world, view, seed, window, first_sample, samples, max_depth, film, squares):
+    """Add samples to the pixels of ``window`` (x0, y0, x1, y1).
 
     Runs without Python's lock, so that threads can share the work; a pixel belongs to one call at a time and its
-    samples are added in order, so the sum is the same bit for bit however rows are shared out.
+    samples are added in order, so the sum is the same bit for bit however tiles are shared out.
+
+    Parameters
+    ----------
+    window:
+        In pixels of the whole image, upper ends excluded.
+    film: (y1 - y0, x1 - x0, CHANNELS)
+        Sums over samples, see ``film.py``; a view of the window's own pixels.
+    squares: (y1 - y0, x1 - x0, 3)
+        Sums of the squares of RGB.
     """
     width, height = view.width, view.height
     m = view.to_world
     buffer = new_ray_buffer(world.embree[2])
-    for row in range(rows[0], rows[1]):
-        for column in range(width):
+    for row in range(window[1], window[3]):
+        for column in range(window[0], window[2]):
             pixel = row * width + column
             # Places in the pixel: the R2 sequence (Roberts 2018), shifted by a hash of the pixel.
             shift = mix(np.uint64(pixel) + mix(np.uint64(seed)))
             shift_x = np.float64(shift >> np.uint64(40)) * 2.0**-24
             shift_y = np.float64((shift >> np.uint64(16)) & np.uint64(0xFFFFFF)) * 2.0**-24
-            out = film[row, column]
+            out = film[row - window[1], column - window[0]]
+            square = squares[row - window[1], column - window[0]]
             for sample in range(first_sample, first_sample + samples):
                 jx = shift_x + 0.7548776662466927 * (sample + 1)
                 jy = shift_y + 0.5698402909980532 * (sample + 1)
@@ -534,6 +541,7 @@ def render_rows(world, view, seed, rows, first_sample, samples, max_depth, film,
                 red, green, blue = _trace_path(
                     world, buffer, stream, m[0, 3], m[1, 3], m[2, 3], dx, dy, dz, max_depth, out
                 )
-                squares[row, column, 0] += red * red
-                squares[row, column, 1] += green * green
-                squares[row, column, 2] += blue * blue
+                out[SAMPLES] += 1.0
+                square[0] += red * red
+                square[1] += green * green
+                square[2] += blue * blue

@@ -15,7 +15,8 @@ from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
 from usdfab.tracer import embree
 from usdfab.tracer.intrinsics import filter_address
-from usdfab.tracer.kernel import CHANNELS, Patches, View, World, render_rows
+from usdfab.tracer.film import CHANNELS
+from usdfab.tracer.kernel import Patches, View, World, render_tile
 from usdfab.tracer.lights import pack_lights
 from usdfab.tracer.macro_scene import build_macro
 from usdfab.tracer.patch_scene import PatchScene, build_patch_scene
@@ -112,7 +113,11 @@ class Tracer:
 
                 def work(rows: tuple[int, int], first: int = done, samples: int = samples) -> None:
                     seed = np.uint64(settings.seed)
-                    render_rows(self.world, view, seed, rows, first, samples, settings.max_depth, film, squares)
+                    part = slice(*rows)
+                    render_tile(
+                        self.world, view, seed, (0, rows[0], width, rows[1]), first, samples, settings.max_depth,
+                        film[part], squares[part],
+                    )  # fmt: skip
 
                 try:
                     for rows, _ in zip(chunks, pool.map(work, chunks), strict=True):

@@ -29,11 +29,11 @@ def read_material(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[Material, list[st
         return np.asarray(fallback if found is None else found, dtype=np.float64)
 
     color = _checked(prim, value("diffuseColor", (0.18, 0.18, 0.18)), "diffuseColor")
-    numbers = [
+    roughness, metallic, opacity = (
         float(_checked(prim, value(name, fallback), name))
         for name, fallback in (("roughness", 0.5), ("metallic", 0.0), ("opacity", 1.0))
-    ]
-    return Material(place, -1, color, *numbers), warnings
+    )
+    return Material(place, -1, color, roughness, metallic, opacity), warnings
 
 
 def _constant(shade_input: UsdShade.Input, time: Usd.TimeCode, place: str, warnings: list[str]) -> object:

@@ -8,7 +8,8 @@ not to be written to.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ IntArray = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A perspective pinhole camera that looks along its -z, y up.
+    """A perspective camera that looks along its -z, y up: a pinhole or, with ``lens_radius`` > 0, a thin lens.
 
     Parameters
     ----------
@@ -35,6 +36,13 @@ class Camera:
         (right, up) has direction ``(tan_half[0] * (s + offset[0]), tan_half[1] * (t + offset[1]), -1)``.
     exposure: EV
         Pixel value = radiance * 2^exposure; holds all of UsdGeomCamera's exposure attributes.
+    lens_radius: metres
+        focalLength / (2 fStop); 0 is a pinhole.
+    focus_distance: metres
+        From the camera to the plane in focus, along -z.
+    to_world_close: (4, 4) or None
+        ``to_world`` at the shutter's closing, where the camera moves while it is open; between, matrices are blended
+        linearly.
     """
 
     path: str
@@ -42,6 +50,9 @@ class Camera:
     tan_half: Array
     offset: Array
     exposure: float
+    lens_radius: float = 0.0
+    focus_distance: float = 0.0
+    to_world_close: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +70,15 @@ class Mesh:
         Texture coordinates at the corners.
     face_material: (T,) int32
         Index into ``Scene.materials``.
+    placements: (K, 3, 4) or None
+        Copies of the mesh: local to world in metres. None: one copy, ``points`` are in world space. Metres of cloth are
+        those of ``points`` before placement times the placement's scale: yarns keep their size where a copy is larger.
+    points_close: (V, 3) or None
+        ``points`` at the shutter's closing, where they move while it is open; straight lines between.
+    placements_close: (K, 3, 4) or None
+        The same for ``placements``.
+    albedo: (T, 3, 3) or None
+        ``primvars:usdfab:albedo`` at the corners, linear Rec. 709; multiplies the fiber albedo of a fabric.
     """
 
     path: str
@@ -68,11 +88,47 @@ class Mesh:
     uv: Array | None
     face_material: IntArray
     double_sided: bool
+    placements: Array | None = None
+    points_close: Array | None = None
+    placements_close: Array | None = None
+    albedo: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """A UsdUVTexture with its coordinates: value = texel(uv') * scale + bias.
+
+    Parameters
+    ----------
+    file:
+        Resolved path of the image.
+    channels:
+        ``"rgb"``, ``"r"``, ``"g"``, ``"b"`` or ``"a"``: the output that is connected.
+    wrap: (s, t)
+        ``"repeat"``, ``"clamp"``, ``"mirror"`` or ``"black"``.
+    linear:
+        Whether texels are data or linear colour; False: they are sRGB and are to be linearised.
+    scale, bias: (4,)
+    uv_transform: (2, 3)
+        uv' = uv_transform @ (u, v, 1), from UsdTransform2d; the identity where there is none.
+    """
+
+    file: str
+    channels: str
+    wrap: tuple[str, str]
+    linear: bool
+    scale: Array
+    bias: Array
+    uv_transform: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """How a face looks. ``fabric`` is an index into ``Scene.fabrics``, or -1; the rest is UsdPreviewSurface's."""
+    """How a face looks. ``fabric`` is an index into ``Scene.fabrics``, or -1; the rest is UsdPreviewSurface's.
+
+    ``textures`` replaces inputs, by UsdPreviewSurface's input names (``diffuseColor``, ``roughness``, ``normal`` ...).
+    ``specular_color`` is None in the metallic workflow. An ``opacity_threshold`` above 0 makes opacity a cut-out.
+    """
 
     path: str
     fabric: int
@@ -80,6 +136,13 @@ class Material:
     roughness: float
     metallic: float
     opacity: float
+    emissive: Array = field(default_factory=lambda: np.zeros(3))
+    specular_color: Array | None = None
+    clearcoat: float = 0.0
+    clearcoat_roughness: float = 0.01
+    ior: float = 1.5
+    opacity_threshold: float = 0.0
+    textures: Mapping[str, Texture] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +152,8 @@ class FabricSurface:
     path: str
     fabric: FabricParameters
     meters_per_uv: float
+    albedo_map: Texture | None = None
+    """Multiplies the fiber albedo; looked up with the mesh's uv."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +202,29 @@ class RectLight:
 
 
 @dataclass(frozen=True, eq=False)
+class DiskLight:
+    """The ellipse ``center + a axis_u + b axis_v``, a^2 + b^2 <= 1, that emits on the side of ``normal``."""
+
+    path: str
+    center: Array
+    axis_u: Array
+    axis_v: Array
+    normal: Array
+    radiance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CylinderLight:
+    """The side of a cylinder, without caps, that emits outward: axis from ``center - half`` to ``center + half``."""
+
+    path: str
+    center: Array
+    half: Array
+    radius: float
+    radiance: Array
+
+
+@dataclass(frozen=True, eq=False)
 class DomeLight:
     """Light from all directions.
 
@@ -160,7 +248,7 @@ class DomeLight:
     texture_path: str = ""
 
 
-Light = PointLight | SphereLight | DistantLight | RectLight | DomeLight
+Light = PointLight | SphereLight | DistantLight | RectLight | DiskLight | CylinderLight | DomeLight
 
 
 @dataclass(frozen=True, eq=False)
