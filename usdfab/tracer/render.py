@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
 from usdfab.tracer import embree
-from usdfab.tracer.intrinsics import filter_address
 from usdfab.tracer.film import CHANNELS
+from usdfab.tracer.intrinsics import filter_address
 from usdfab.tracer.kernel import Patches, View, World, render_tile
 from usdfab.tracer.lights import pack_lights
 from usdfab.tracer.macro_scene import build_macro
