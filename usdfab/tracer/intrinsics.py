@@ -47,6 +47,23 @@ def _as_pointer(typingctx, address):
     return signature, codegen
 
 
+@intrinsic
+def borrow(typingctx, array):
+    """The same array without its owner, so that kernels do not count references (atomic operations on shared memory).
+
+    The caller keeps the array alive.
+    """
+    signature = array(array)
+
+    def codegen(context, builder, signature, args):
+        view = context.make_array(signature.args[0])(context, builder, args[0])
+        view.meminfo = ir.Constant(view.meminfo.type, None)
+        view.parent = ir.Constant(view.parent.type, None)
+        return view._getvalue()
+
+    return signature, codegen
+
+
 @cfunc(types.void(types.CPointer(types.uint64)), cache=True)
 def reject_back_faces(arguments):
     """Embree filter: refuse hits on the inside of a fiber.

@@ -38,6 +38,7 @@ from usdfab.tracer.intrinsics import (
     TFAR,
     U,
     V,
+    borrow,
     intersect,
     new_ray_buffer,
     occluded,
@@ -49,7 +50,10 @@ MAX_TILES = 256
 """Tile borders a ray may cross before it counts as having left; only rays within 1e-3 of the plane get there."""
 MAX_SURFACES = 64
 """Fabric layers that a shadow ray may pass."""
-RUSSIAN_ROULETTE_DEPTH = 5
+import os
+RUSSIAN_ROULETTE_DEPTH = int(os.environ.get('RRD','5'))
+SHADOW=float(os.environ.get('SH','1e30'))
+RRK=float(os.environ.get('RRK','1'))
 
 ESCAPED_UP, ESCAPED_DOWN, HIT = 1, -1, 0
 
@@ -446,7 +450,14 @@ def _trace_path(world, buffer, stream, ox, oy, oz, dx, dy, dz, max_depth, out):
                     fr, fg, fb = base_r * pdf, base_g * pdf, base_b * pdf
                     qx = qy = qz = 0.0
                 weight = 1.0 if light_pdf == 0.0 else light_pdf / (light_pdf + pdf)
-                cr, cg, cb = beta_r * fr * lr * weight, beta_g * fg * lg * weight, beta_b * fb * lb * weight
+                fr, fg, fb = beta_r * fr * weight, beta_g * fg * weight, beta_b * fb * weight
+                keep = max(fr, fg, fb) * SHADOW
+                if keep < 1.0:
+                    stream, u0 = next_uniform(stream)
+                    keep = 1.0 / keep if u0 < keep else 0.0
+                else:
+                    keep = 1.0
+                cr, cg, cb = keep * fr * lr, keep * fg * lg, keep * fb * lb
                 reach = distance * (1.0 - 1e-6)
                 # Area lights stand in each other's way, as they do for rays that the BSDF draws.
                 if cr + cg + cb > 0.0 and hit_light(lights, ox, oy, oz, wx, wy, wz, reach, -1.0)[0] >= reach:
@@ -488,13 +499,23 @@ def _trace_path(world, buffer, stream, ox, oy, oz, dx, dy, dz, max_depth, out):
         if bsdf_pdf <= 0.0 or beta_r + beta_g + beta_b <= 0.0:
             break
         if depth >= RUSSIAN_ROULETTE_DEPTH:
-            survive = min(0.95, max(beta_r, beta_g, beta_b))
+            survive = min(0.95, RRK * max(beta_r, beta_g, beta_b))
             stream, u0 = next_uniform(stream)
             if u0 >= survive:
                 break
             beta_r, beta_g, beta_b = beta_r / survive, beta_g / survive, beta_b / survive
     out[0], out[1], out[2] = out[0] + total_r, out[1] + total_g, out[2] + total_b
     return total_r, total_g, total_b
+
+
+@njit(cache=True)
+def _borrowed(world):
+    """The world with arrays that are not reference-counted."""
+    m, p, l = world.macro, world.patches, world.lights
+    macro = Macro(borrow(m.points), borrow(m.geometric), borrow(m.normals), borrow(m.tangents), borrow(m.uv), borrow(m.scale), borrow(m.sign), borrow(m.material), borrow(m.mesh), borrow(m.surfaces))
+    patches = Patches(borrow(p.table), borrow(p.handles), borrow(p.tangents), borrow(p.segment_vertex), borrow(p.segment_material), borrow(p.materials), borrow(p.albedo))
+    lights = Lights(borrow(l.table), borrow(l.image), borrow(l.rows), borrow(l.columns))
+    return World(macro, patches, lights, world.embree)
 
 
 @njit(cache=True, nogil=True)
@@ -515,7 +536,9 @@ def render_tile(world, view, seed, window, first_sample, samples, max_depth, fil
     """
     width, height = view.width, view.height
     m = view.to_world
-    buffer = new_ray_buffer(world.embree[2])
+    memory = new_ray_buffer(world.embree[2])
+    buffer = (borrow(memory[0]), borrow(memory[1]), memory[2])
+    world = _borrowed(world)
     for row in range(window[1], window[3]):
         for column in range(window[0], window[2]):
             pixel = row * width + column

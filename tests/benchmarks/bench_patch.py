@@ -1,0 +1,166 @@
+"""Time to equal noise: our path tracer and Mitsuba 3 on the same flat samples, in one run on all cores.
+
+    python tests/benchmarks/bench_patch.py [--smoke] [--weaves plain,twill,satin] [--ours] [--side 400]
+
+Samples follow the medians of Table 4 (Li et al. 2024) under the capture rig; depth 32; Mitsuba's `path` on the same
+B-spline curves with its `hair` BSDF (`llvm_ad_rgb` where an LLVM library is found, else `scalar_rgb`). The noise is
+
+    relMSE = mean over pixels and channels of variance / (mean^2 + (0.1 x picture's mean)^2)
+
+with variance and mean from independent runs, so that each program is its own reference. Seconds to relMSE 0.01 are
+`seconds of a run x relMSE of a run / 0.01`; runs have about as many samples as that takes. Kernels are compiled before
+the clock runs. Mitsuba renders each weave in a process of its own. One line of JSON for each weave.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tracer"))
+sys.path.insert(0, str(Path(__file__).parent))
+
+import mitsuba_scene
+from bench_tracer import find_llvm
+
+from usdfab.fabric import FabricParameters, YarnParameters, weave_from_name
+from usdfab.fibers import generate_patch
+from usdfab.tracer import RenderSettings, Tracer
+from usdfab.usd.rig import swatch_scene
+
+DEPTH = 32
+TARGET = 0.01
+SIDE_M = 5e-3
+
+
+def sample(weave: str, fibers: int = 200) -> FabricParameters:
+    """The medians of Table 4; Mitsuba has one longitudinal roughness for all lobes, so gamma_M0 = gamma_M."""
+    common = {
+        "fiber_count": fibers, "irregularity": 0.15, "migration": 0.75, "twist": 0.03, "inclination": 0.8,
+        "roughness_longitudinal": 0.45, "roughness_primary": 0.45, "roughness_azimuthal": 0.1,
+        "albedo": (0.7, 0.5, 0.3),
+    }  # fmt: skip
+    counts, radii, crimps, flattening = {
+        "plain": ((6, 8), (0.075, 0.075), (0.9, 0.9), (1.0, 1.0)),
+        "twill": ((10, 12), (0.056, 0.047), (0.9, 0.9), (1.0, 1.0)),
+        "satin": ((10, 12), (0.029, 0.02), (0.3, 1.0), (1.7, 2.0)),
+    }[weave]
+    warp, weft = (
+        YarnParameters(count=n, radius=r * SIDE_M, crimp=c, flattening=f, **common)
+        for n, r, c, f in zip(counts, radii, crimps, flattening, strict=True)
+    )
+    name = {"plain": "plain", "twill": "twill_1_3", "satin": "satin"}[weave]
+    return FabricParameters(weave_from_name(name), (SIDE_M, SIDE_M), warp, weft, name=weave)
+
+
+def noise(pictures: list) -> tuple[float, float]:
+    """Brightness and relMSE of one run, from independent runs."""
+    stack = np.asarray(pictures, dtype=float)
+    mean = stack.mean(axis=0)
+    floor = (0.1 * mean.mean()) ** 2
+    return float(mean.mean()), float((stack.var(axis=0, ddof=1) / (mean**2 + floor)).mean())
+
+
+def ours(weave: str, fibers: int, side: int, spp: int, runs: int, threads: int | None = None) -> dict:
+    """Seconds and noise of one run of the tracer."""
+    scene = swatch_scene(sample(weave, fibers))
+    start = time.perf_counter()
+    tracer = Tracer(scene)
+    build = time.perf_counter() - start
+    camera = scene.cameras[0]
+    tracer.render(camera, RenderSettings((8, 8), spp=2, max_depth=DEPTH))
+    renders = [
+        tracer.render(camera, RenderSettings((side, side), spp, DEPTH, seed=k, threads=threads)) for k in range(runs)
+    ]
+    mean, error = noise([r.pixels for r in renders])
+    seconds = sum(r.seconds for r in renders) / runs
+    paths = side * side * spp
+    return {
+        "to_target_s": seconds * error / TARGET, "s": seconds, "relmse": error, "mean": mean,
+        "us_per_path": 1e6 * seconds / paths, "rays_per_path": renders[0].rays / paths, "segments": tracer.segments,
+        "build_s": build,
+    }  # fmt: skip
+
+
+def mitsuba(weave: str, fibers: int, side: int, spp: int, runs: int) -> dict:
+    """The same of Mitsuba; in a process of its own."""
+    llvm = find_llvm()
+    if llvm:
+        os.environ["DRJIT_LIBLLVM_PATH"] = llvm
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb" if llvm else "scalar_rgb")
+    cloth = sample(weave, fibers)
+    scene = swatch_scene(cloth)
+    cell = cloth.cell
+    picks, ends = cloth.repeat()
+    # Enough of the patch to cover the sample, and at least two cells around it, as far as light wanders.
+    margin = [-(-2 // ends), -(-2 // picks)]
+    repeat = np.array([ends * cell[0], picks * cell[1]])
+    copies = [int(np.ceil(s / r - 1e-6)) + 2 * m for s, r, m in zip(cloth.size, repeat, margin, strict=True)]
+    patch = generate_patch(cloth, copies=(copies[0], copies[1]))
+    with tempfile.TemporaryDirectory() as folder:
+        center = np.asarray(cloth.size) / 2 + np.asarray(margin) * repeat
+        files = mitsuba_scene.curves_text(patch, 0, center, Path(folder))
+        light = list(scene.lights)
+        description = mitsuba_scene.mitsuba_dict(mi, cloth, files, scene.cameras[0], light, (side, side), DEPTH)
+        loaded = mi.load_dict(description)
+    np.array(mi.render(loaded, spp=spp, seed=999))
+    start = time.perf_counter()
+    pictures = [np.array(mi.render(loaded, spp=spp, seed=k)) for k in range(runs)]
+    seconds = (time.perf_counter() - start) / runs
+    mean, error = noise(pictures)
+    return {
+        "to_target_s": seconds * error / TARGET, "s": seconds, "relmse": error, "mean": mean,
+        "us_per_path": 1e6 * seconds / (side * side * spp), "variant": mi.variant(),
+    }  # fmt: skip
+
+
+def _child(queue, arguments: tuple) -> None:
+    queue.put(mitsuba(*arguments))
+
+
+def in_a_process(*arguments) -> dict:
+    """``mitsuba`` in a fresh process, which must end well."""
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    process = context.Process(target=_child, args=(queue, arguments))
+    process.start()
+    result = queue.get(timeout=1800)
+    process.join()
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--smoke", action="store_true", help="a few seconds, to see that it runs")
+    parser.add_argument("--weaves", default="plain,twill,satin")
+    parser.add_argument("--ours", action="store_true", help="leave Mitsuba out")
+    parser.add_argument("--side", type=int, default=400)
+    parser.add_argument("--spp", type=int, default=32)
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=None)
+    arguments = parser.parse_args()
+    side, spp, runs, fibers = arguments.side, arguments.spp, arguments.runs, 200
+    if arguments.smoke:
+        side, spp, runs, fibers = 24, 4, 2, 8
+    for weave in arguments.weaves.split(","):
+        row = {"bench": "patch", "weave": weave, "side": side, "spp": spp, "runs": runs, "load": os.getloadavg()[0]}
+        row["ours"] = ours(weave, fibers, side, spp, runs, arguments.threads)
+        if not arguments.ours:
+            row["mitsuba"] = in_a_process(weave, fibers, side, spp, runs)
+            row["ratio"] = row["ours"]["to_target_s"] / row["mitsuba"]["to_target_s"]
+            row["brightness"] = row["ours"]["mean"] / row["mitsuba"]["mean"]
+        print(json.dumps(row, default=float), flush=True)
+
+
+if __name__ == "__main__":
+    main()
