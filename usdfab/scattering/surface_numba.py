@@ -143,7 +143,7 @@ def pack_surface(
 def _color(value: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
     color = np.asarray(value, dtype=np.float64)
     if color.shape != (3,) or not np.all((color >= 0.0) & (color <= 1.0)):
-        raise UsdfabError(f"{value} is not a colour", place=name, remedy="give three numbers from 0 to 1")
+        raise UsdfabError(f"{color.tolist()} is not a colour", place=name, remedy="give three numbers from 0 to 1")
     return color
 
 
