@@ -208,6 +208,22 @@ def test_samples_are_hit(kind, place, a, b, seed, log_scale):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_the_origin_may_move_on(kind):
+    """The weight belongs to the point where the direction was drawn, wherever on the way the ray begins."""
+    light = make(kind, np.array([0.3, 0.2, 1.5]), np.diag([1.0, -1.0, -1.0]), 0.4, 0.7)
+    lights, p = (
+        pack(light, SphereLight("/Other", np.array([0.0, -3.0, 2.0]), 0.5, RADIANCE)),
+        np.array([0.1, -0.2, 0.3]),
+    )
+    for x, y, z, distance, *_, pdf in draw(lights, p, 50):
+        there = hit_light(lights, *p, x, y, z, FAR, 0.5, *p)
+        on = hit_light(lights, *(p + 0.7 * distance * np.array([x, y, z])), x, y, z, FAR, 0.5, *p)
+        assert on[0] == pytest.approx(0.3 * distance, rel=1e-6)
+        assert on[1:] == pytest.approx(there[1:], rel=1e-6)
+        assert there[1] == pytest.approx(RADIANCE[0] * 0.5 / (0.5 + pdf), rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", range(4))
 def test_density_integrates_to_one(kind, seed):
     """Thrown rays: the mean of the density that ``hit_light`` uses, and of the radiance against the quadrature."""
@@ -354,7 +370,7 @@ def test_black_lights():
 def _weighted(lights, p, u, out):
     """Irradiance on the upper side of a plane at p: (n, 3) from the lights and (n, 3) from a uniform BSDF, weighted.
 
-    The second ray's origin moves on, as through a slab, by a part of the way to the nearest light.
+    The second ray's origin moves on, as through a slab, by less than the way to the nearest light.
     """
     uniform = 0.5 / math.pi
     for k in range(len(u)):
@@ -365,7 +381,8 @@ def _weighted(lights, p, u, out):
         z, phi = u[k, 3], 2.0 * math.pi * u[k, 4]
         sine = math.sqrt(1.0 - z * z)
         x, y = sine * math.cos(phi), sine * math.sin(phi)
-        ox, oy, oz = p[0] + 0.1 * u[k, 2] * x, p[1] + 0.1 * u[k, 2] * y, p[2] + 0.1 * u[k, 2] * z
+        on = 0.6 * u[k, 2]
+        ox, oy, oz = p[0] + on * x, p[1] + on * y, p[2] + on * z
         t, r, g, b = hit_light(lights, ox, oy, oz, x, y, z, FAR, uniform, p[0], p[1], p[2])
         if t >= FAR:
             r, g, b = escaped_radiance(lights, x, y, z, uniform, p[0], p[1], p[2])

@@ -16,8 +16,10 @@ from numba import njit
 _OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy"}
 _INLINE: dict[str, Any] = {**_OPTIONS, "forceinline": True}
 
-_SMALL_SOLID_ANGLE = 1e-5
-"""Rectangles that look smaller are sampled by area: their solid angle would be a difference of large numbers."""
+_FAR = 30.0
+"""Rectangles whose squared distance is more than so many areas are sampled by area: cheaper, and nearly as good."""
+_SMALL_SOLID_ANGLE = 1e-6
+"""So are those that look smaller, edge-on: their solid angle would be a difference of large numbers."""
 
 
 @njit(**_INLINE)
@@ -150,11 +152,12 @@ def _rect_view(light, px, py, pz):
 
     In a frame along the edges whose origin is the point, the rectangle is [x0, x1] x [y0, y1] at ``height`` away. A
     corner rectangle [0, x] x [0, y] fills the solid angle asin(a b), a = x / sqrt(x^2 + height^2), b likewise; four of
-    those add up. The solid angle is 0 where area sampling is to be used: tiny, sheared (19 is 0) or seen from behind.
+    those add up. The solid angle is 0 where area sampling is to be used: far away, sheared (19 is 0) or seen from behind.
     """
     x, y, z = light[5] - px, light[6] - py, light[7] - pz
     height = -(x * light[15] + y * light[16] + z * light[17])
-    if light[19] == 0.0 or height * height <= 1e-14 * light[18]:
+    d2 = (light[20] - px) ** 2 + (light[21] - py) ** 2 + (light[22] - pz) ** 2
+    if light[19] == 0.0 or d2 > _FAR * light[18] or height * height <= 1e-14 * light[18]:
         return 0.0, height, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0
     u = math.sqrt(light[9] ** 2 + light[10] ** 2 + light[11] ** 2)
     v = math.sqrt(light[12] ** 2 + light[13] ** 2 + light[14] ** 2)
