@@ -17,14 +17,19 @@ _OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy"}
 
 
 def image_distribution(image: NDArray) -> tuple[NDArray, NDArray]:
-    """Cumulative distributions for drawing texels by luminance times solid angle: rows (H+1,), columns (H, W+1)."""
-    height = image.shape[0]
-    sine = np.sin((np.arange(height) + 0.5) * math.pi / height)
-    weight = image.max(axis=2) * sine[:, None] + 1e-9 * sine[:, None]
-    columns = np.zeros((height, image.shape[1] + 1))
-    columns[:, 1:] = np.cumsum(weight, axis=1)
-    rows = np.r_[0.0, np.cumsum(columns[:, -1])]
-    columns /= columns[:, -1:]
+    """Cumulative distributions for drawing texels by brightness times solid angle.
+
+    Rows (H+1,) float64, columns (H, W+1) float32: panoramas are large. A texel too dim to have a width in float32 is
+    not drawn and has density 0; rays that the BSDF draws find it.
+    """
+    height, width = image.shape[:2]
+    columns = np.zeros((height, width + 1), dtype=np.float32)
+    sums = np.zeros(height)
+    for row, pixels, i in zip(columns, image, range(height), strict=True):
+        cumulative = np.cumsum(pixels.max(axis=1) + 1e-9, dtype=np.float64)
+        sums[i] = cumulative[-1] * math.sin((i + 0.5) * math.pi / height)
+        row[1:] = cumulative / cumulative[-1]
+    rows = np.r_[0.0, np.cumsum(sums)]
     return rows / rows[-1], columns
 
 

@@ -152,7 +152,7 @@ def _rect_view(light, px, py, pz):
 
     In a frame along the edges whose origin is the point, the rectangle is [x0, x1] x [y0, y1] at ``height`` away. A
     corner rectangle [0, x] x [0, y] fills the solid angle asin(a b), a = x / sqrt(x^2 + height^2), b likewise; four of
-    those add up. The solid angle is 0 where area sampling is to be used: far away, sheared (19 is 0) or seen from behind.
+    those add up. The solid angle is 0 where area sampling is to be used: far away, sheared (19 is 0), from behind.
     """
     x, y, z = light[5] - px, light[6] - py, light[7] - pz
     height = -(x * light[15] + y * light[16] + z * light[17])

@@ -72,9 +72,9 @@ class Lights(NamedTuple):
     """Packed lights. ``table`` (L, COLUMNS); the dome's texture with its distribution over rows and columns."""
 
     table: NDArray[np.float64]
-    image: NDArray[np.float64]
+    image: NDArray[np.float32]
     rows: NDArray[np.float64]
-    columns: NDArray[np.float64]
+    columns: NDArray[np.float32]
 
 
 def pack_lights(scene: Scene, textures: Mapping[str, NDArray[np.float32]]) -> Lights:
@@ -87,8 +87,8 @@ def pack_lights(scene: Scene, textures: Mapping[str, NDArray[np.float32]]) -> Li
         not finite.
     """
     table = np.zeros((len(scene.lights), COLUMNS))
-    image = np.zeros((1, 1, 3))
-    rows, columns = np.zeros(2), np.zeros((1, 2))
+    image = np.zeros((1, 1, 3), dtype=np.float32)
+    rows, columns = np.zeros(2), np.zeros((1, 2), dtype=np.float32)
     textured = False
     for light, record in zip(scene.lights, table, strict=True):
         _pack(light, record)
@@ -98,7 +98,7 @@ def pack_lights(scene: Scene, textures: Mapping[str, NDArray[np.float32]]) -> Li
             textured = True
             image = _texture(light, textures)
             rows, columns = image_distribution(image)
-            record[1] *= image.mean()
+            record[1] *= image.mean(dtype=np.float64)
         if not np.isfinite(record).all():
             raise UsdfabError("the light has numbers that are not finite", place=light.path, remedy="repair it")
     return Lights(table, image, rows, columns)
@@ -148,11 +148,11 @@ def _pack(light: Light, record: NDArray[np.float64]) -> None:
         record[2:5], record[1], record[23] = light.radiance, np.max(light.radiance) * area, area / math.pi
 
 
-def _texture(light: DomeLight, textures: Mapping[str, NDArray[np.float32]]) -> NDArray[np.float64]:
+def _texture(light: DomeLight, textures: Mapping[str, NDArray[np.float32]]) -> NDArray[np.float32]:
     if light.texture is None and light.texture_path not in textures:
         raise UsdfabError(f"the texture {light.texture_path} was not loaded", place=light.path)
-    image = np.asarray(textures[light.texture_path] if light.texture is None else light.texture, dtype=float)
-    return np.ascontiguousarray(image)
+    image = textures[light.texture_path] if light.texture is None else light.texture
+    return np.ascontiguousarray(image, dtype=np.float32)
 
 
 # --- choice ----------------------------------------------------------------------------------------------------------
