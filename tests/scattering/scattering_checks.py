@@ -179,6 +179,11 @@ def chi_square_p_value(fiber, h, theta_o, n=100_000, cells=(24, 40), seed=0):
     observed = np.histogram2d(np.arcsin(samples[:, 0]), samples[:, 2], bins=edges)[0]
     assert observed.sum() == n
 
+    return goodness_of_fit(observed, expected)
+
+
+def goodness_of_fit(observed, expected):
+    """Pearson's p-value for counts, any shape; cells that expect fewer than 5 are pooled into one."""
     few = expected < 5.0
     observed = np.append(observed[~few], observed[few].sum())
     expected = np.append(expected[~few], expected[few].sum())
