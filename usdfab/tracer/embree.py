@@ -21,9 +21,11 @@ from usdfab.errors import UsdfabError
 
 _GEOMETRY_TRIANGLE = 0
 _GEOMETRY_ROUND_LINEAR_CURVE = 16
+_GEOMETRY_INSTANCE = 121
 _BUFFER_INDEX, _BUFFER_VERTEX, _BUFFER_FLAGS = 0, 1, 32
 _FORMAT_UCHAR, _FORMAT_UINT, _FORMAT_UINT3 = 0x1001, 0x5001, 0x5003
 _FORMAT_FLOAT3, _FORMAT_FLOAT4 = 0x9003, 0x9004
+_FORMAT_FLOAT3X4_ROW_MAJOR = 0x9134
 _BUILD_QUALITY_HIGH = 2
 _SCENE_ROBUST = 4
 _PROPERTY_VERSION, _PROPERTY_CURVES, _PROPERTY_FILTER = 0, 99, 66
@@ -79,6 +81,10 @@ def library() -> ctypes.CDLL:
         "rtcSetSharedGeometryBuffer": (None, [p, ctypes.c_int, u, ctypes.c_int, p, s, s, s]),
         "rtcCommitGeometry": (None, [p]),
         "rtcAttachGeometry": (u, [p, p]),
+        "rtcAttachGeometryByID": (None, [p, p, u]),
+        "rtcSetGeometryTimeStepCount": (None, [p, u]),
+        "rtcSetGeometryInstancedScene": (None, [p, p]),
+        "rtcSetGeometryTransform": (None, [p, u, ctypes.c_int, ctypes.c_void_p]),
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(lib, name)
@@ -116,31 +122,60 @@ def function_addresses() -> tuple[int, int]:
 
 
 class EmbreeScene:
-    """A committed Embree scene with one geometry. Keeps its buffers alive; freed with the object.
+    """A committed Embree scene. Keeps its buffers alive; freed with the object.
 
     ``handle`` is the address that kernels pass to Embree.
     """
 
-    def __init__(self, geometry_type: int, buffers: list[tuple[int, int, NDArray, int]]) -> None:
-        lib, dev = library(), device()
-        self._buffers = [_padded(array) for _, _, array, _ in buffers]
-        self.handle: int = lib.rtcNewScene(dev)
+    def __init__(self) -> None:
+        lib = library()
+        self._buffers: list[NDArray[np.uint8]] = []
+        self._scenes: list[EmbreeScene] = []
+        self._geometries = 0
+        self.handle: int = lib.rtcNewScene(device())
         self._finalizer = weakref.finalize(self, lib.rtcReleaseScene, self.handle)
         lib.rtcSetSceneFlags(self.handle, _SCENE_ROBUST)
         lib.rtcSetSceneBuildQuality(self.handle, _BUILD_QUALITY_HIGH)
-        geometry = lib.rtcNewGeometry(dev, geometry_type)
-        for (kind, data_format, array, stride), memory in zip(buffers, self._buffers, strict=True):
+
+    def add(self, geometry_type: int, buffers: list[tuple[int, int, int, NDArray, int]], time_steps: int = 1) -> None:
+        """Add a geometry from (kind, slot, format, array, stride) buffers."""
+        lib = library()
+        geometry = lib.rtcNewGeometry(device(), geometry_type)
+        lib.rtcSetGeometryTimeStepCount(geometry, time_steps)
+        for kind, slot, data_format, array, stride in buffers:
+            memory = _padded(array)
+            self._buffers.append(memory)
             lib.rtcSetSharedGeometryBuffer(
-                geometry, kind, 0, data_format, memory.ctypes.data, 0, stride, array.nbytes // stride
+                geometry, kind, slot, data_format, memory.ctypes.data, 0, stride, array.nbytes // stride
             )
         lib.rtcSetGeometryBuildQuality(geometry, _BUILD_QUALITY_HIGH)
+        self._attach(geometry)
+
+    def add_instance(self, scene: EmbreeScene, to_world: NDArray) -> None:
+        """Add a placed copy of a committed scene; ``to_world`` (K, 3, 4) at K equally spaced times."""
+        lib = library()
+        geometry = lib.rtcNewGeometry(device(), _GEOMETRY_INSTANCE)
+        lib.rtcSetGeometryInstancedScene(geometry, scene.handle)
+        lib.rtcSetGeometryTimeStepCount(geometry, len(to_world))
+        for step, matrix in enumerate(np.ascontiguousarray(to_world, dtype=np.float32)):
+            lib.rtcSetGeometryTransform(geometry, step, _FORMAT_FLOAT3X4_ROW_MAJOR, matrix.ctypes.data)
+        self._scenes.append(scene)
+        self._attach(geometry)
+
+    def _attach(self, geometry: int) -> None:
+        lib = library()
         lib.rtcCommitGeometry(geometry)
-        lib.rtcAttachGeometry(self.handle, geometry)
+        lib.rtcAttachGeometryByID(self.handle, geometry, self._geometries)
         lib.rtcReleaseGeometry(geometry)
-        lib.rtcCommitScene(self.handle)
-        error = lib.rtcGetDeviceError(dev)
+        self._geometries += 1
+
+    def commit(self) -> EmbreeScene:
+        """Build the hierarchy; rays can be traced from now on."""
+        library().rtcCommitScene(self.handle)
+        error = library().rtcGetDeviceError(device())
         if error:
             raise UsdfabError(f"Embree could not build the scene: {_ERRORS.get(error, error)}")
+        return self
 
     @property
     def nbytes(self) -> int:
@@ -154,14 +189,16 @@ def _padded(array: NDArray) -> NDArray[np.uint8]:
     return memory
 
 
-def triangle_scene(points: NDArray, triangles: NDArray) -> EmbreeScene:
-    """A scene of triangles: points (V, 3), triangles (T, 3)."""
-    return EmbreeScene(
+def add_triangles(scene: EmbreeScene, points: NDArray, triangles: NDArray) -> None:
+    """Add triangles (T, 3) to a scene: points (V, 3), or (K, V, 3) at K equally spaced times."""
+    keys = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, *points.shape[-2:])
+    scene.add(
         _GEOMETRY_TRIANGLE,
         [
-            (_BUFFER_VERTEX, _FORMAT_FLOAT3, np.ascontiguousarray(points, dtype=np.float32), 12),
-            (_BUFFER_INDEX, _FORMAT_UINT3, np.ascontiguousarray(triangles, dtype=np.uint32), 12),
+            *((_BUFFER_VERTEX, slot, _FORMAT_FLOAT3, key, 12) for slot, key in enumerate(keys)),
+            (_BUFFER_INDEX, 0, _FORMAT_UINT3, np.ascontiguousarray(triangles, dtype=np.uint32), 12),
         ],
+        len(keys),
     )
 
 
@@ -177,11 +214,13 @@ def curve_scene(vertices: NDArray, first: NDArray, flags: NDArray) -> EmbreeScen
     flags: (S,)
         ``NEIGHBOR_LEFT | NEIGHBOR_RIGHT``: whether vertex ``first - 1`` and ``first + 2`` continue the curve.
     """
-    return EmbreeScene(
+    scene = EmbreeScene()
+    scene.add(
         _GEOMETRY_ROUND_LINEAR_CURVE,
         [
-            (_BUFFER_VERTEX, _FORMAT_FLOAT4, np.ascontiguousarray(vertices, dtype=np.float32), 16),
-            (_BUFFER_INDEX, _FORMAT_UINT, np.ascontiguousarray(first, dtype=np.uint32), 4),
-            (_BUFFER_FLAGS, _FORMAT_UCHAR, np.ascontiguousarray(flags, dtype=np.uint8), 1),
+            (_BUFFER_VERTEX, 0, _FORMAT_FLOAT4, np.ascontiguousarray(vertices, dtype=np.float32), 16),
+            (_BUFFER_INDEX, 0, _FORMAT_UINT, np.ascontiguousarray(first, dtype=np.uint32), 4),
+            (_BUFFER_FLAGS, 0, _FORMAT_UCHAR, np.ascontiguousarray(flags, dtype=np.uint8), 1),
         ],
     )
+    return scene.commit()

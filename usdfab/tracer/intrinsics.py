@@ -103,11 +103,11 @@ def new_ray_buffer(filter_function):
 
 
 @njit(cache=True, inline="always")
-def intersect(function, scene, buffer, ox, oy, oz, dx, dy, dz, tnear, tfar, arguments):
+def intersect(function, scene, buffer, ox, oy, oz, dx, dy, dz, tnear, tfar, arguments, time=0.0):
     """Nearest hit along the ray. True on a hit; the hit's fields are in the buffer (TFAR, NG, U, V, PRIM)."""
     f, w, address = buffer
     f[ORG], f[ORG + 1], f[ORG + 2], f[TNEAR] = ox, oy, oz, tnear
-    f[DIR], f[DIR + 1], f[DIR + 2], f[TIME] = dx, dy, dz, 0.0
+    f[DIR], f[DIR + 1], f[DIR + 2], f[TIME] = dx, dy, dz, time
     f[TFAR] = tfar
     w[MASK], w[ID], w[FLAGS] = _INVALID, np.uint32(0), np.uint32(0)
     w[GEOM], w[INST] = _INVALID, _INVALID
@@ -116,11 +116,11 @@ def intersect(function, scene, buffer, ox, oy, oz, dx, dy, dz, tnear, tfar, argu
 
 
 @njit(cache=True, inline="always")
-def occluded(function, scene, buffer, ox, oy, oz, dx, dy, dz, tnear, tfar, arguments):
+def occluded(function, scene, buffer, ox, oy, oz, dx, dy, dz, tnear, tfar, arguments, time=0.0):
     """Whether anything lies on the ray between tnear and tfar."""
     f, w, address = buffer
     f[ORG], f[ORG + 1], f[ORG + 2], f[TNEAR] = ox, oy, oz, tnear
-    f[DIR], f[DIR + 1], f[DIR + 2], f[TIME] = dx, dy, dz, 0.0
+    f[DIR], f[DIR + 1], f[DIR + 2], f[TIME] = dx, dy, dz, time
     f[TFAR] = tfar
     w[MASK], w[ID], w[FLAGS] = _INVALID, np.uint32(0), np.uint32(0)
     _call_embree(function, scene, address, address + np.uint64(4 * arguments))

@@ -1,10 +1,9 @@
 """The two-scale path tracer: one Numba kernel, one path after the other (Li et al. 2024, section 6).
 
-Two places a ray can be. At *macro* scale it flies through the world and meets meshes and lights. Inside a *slab* it
-flies through one fabric's tile, which repeats for ever. A ray that meets a mesh with a fabric goes into that fabric's
-slab through a similarity transform fixed at the hit (``Slab``): the patch's x axis along dp/du, its z axis along the
-normal, its scale from the uv density. It comes back to macro scale when it leaves the slab above or below. Places are
-kept in both spaces, so that a flat sample is traced exactly.
+Two places a ray can be. At *macro* scale it flies through the world and meets meshes and lights (``surfaces.py``).
+Inside a *slab* it flies through one fabric's tile, which repeats for ever (``slab.py``). A ray that meets a mesh with a
+fabric goes into that fabric's slab, and comes back to macro scale when it leaves the slab above or below. Places are
+kept in both spaces, so that a flat sample is traced exactly; shading happens in the world.
 
 Notation: ``d`` direction of flight in the world, ``beta`` throughput, ``L`` radiance. Fibers follow the conventions of
 ``scattering.fiber_numba``; depth counts as in Mitsuba: 1 sees lights, 2 adds direct light.
@@ -13,11 +12,9 @@ Notation: ``d`` direction of flight in the world, ``beta`` throughput, ``L`` rad
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from usdfab.scattering.fiber_numba import (
     eval_fiber,
@@ -28,347 +25,182 @@ from usdfab.scattering.fiber_numba import (
     prepare_fiber,
     sample_fiber,
 )
+from usdfab.scattering.surface_numba import eval_surface, prepare_surface, sample_surface
 from usdfab.tracer.counted import mix, next_uniform, start_stream
-from usdfab.tracer.film import SAMPLES
-from usdfab.tracer.intrinsics import (
-    ARGS_FILTER,
-    ARGS_PLAIN,
-    NG,
-    PRIM,
-    TFAR,
-    U,
-    V,
-    borrow,
-    intersect,
-    new_ray_buffer,
-    occluded,
-)
-from usdfab.tracer.lights import FAR, Lights, escaped_radiance, hit_light, sample_light
-from usdfab.tracer.macro_scene import Macro
+from usdfab.tracer.film import ALBEDO, ALPHA, DEPTH, DIRECT, FIBER_ID, NORMAL, RAYS, SAMPLES, UV, YARN_ID
+from usdfab.tracer.intrinsics import NG, PRIM, U, borrow, new_ray_buffer
+from usdfab.tracer.lights import FAR, escaped_radiance, hit_light, light_blocks, sample_light
+from usdfab.tracer.slab import HIT, enter_slab, inverse_columns, leave_slab, slab_occluded, to_patch, trace_slab
+from usdfab.tracer.surfaces import MAX_SURFACES, surface_frame, trace_macro, transmittance
+from usdfab.tracer.textures import lookup, normal_at, opacity_at, surface_at
+from usdfab.tracer.world import ALBEDO_MAP, FIRST_PATCH, FIRST_SEGMENT, borrowed
 
-MAX_TILES = 256
-"""Tile borders a ray may cross before it counts as having left; only rays within 1e-3 of the plane get there."""
-MAX_SURFACES = 64
-"""Fabric layers that a shadow ray may pass."""
-import os
-RUSSIAN_ROULETTE_DEPTH = int(os.environ.get('RRD','5'))
-SHADOW=float(os.environ.get('SH','1e30'))
-RRK=float(os.environ.get('RRK','1'))
+RUSSIAN_ROULETTE_DEPTH = 5
+SHADOW_ROULETTE = 2.0 * math.pi
+"""Light that would arrive with less than half of what isotropic scattering gives gets its shadow ray by chance only.
 
-ESCAPED_UP, ESCAPED_DOWN, HIT = 1, -1, 0
-
-
-class Patches(NamedTuple):
-    """All tiles of a scene.
-
-    ``table`` (P, 8): width, height, lowest z, highest z, epsilon, first segment, first vertex, units per metre.
-
-    ``handles`` (P,) Embree scenes; the other arrays are those of ``PatchScene``, one patch after the other.
-    """
-
-    table: NDArray[np.float64]
-    handles: NDArray[np.uint64]
-    tangents: NDArray[np.float32]
-    segment_vertex: NDArray[np.int32]
-    segment_material: NDArray[np.int32]
-    materials: NDArray[np.float64]
-    albedo: NDArray[np.float64]
-
-
-class World(NamedTuple):
-    """Everything the kernel reads. ``embree`` holds addresses: rtcIntersect1, rtcOccluded1, filter, macro scene."""
-
-    macro: Macro
-    patches: Patches
-    lights: Lights
-    embree: tuple[np.uint64, np.uint64, np.uint64, np.uint64]
-
-
-class View(NamedTuple):
-    """A pinhole camera. ``to_world`` (3, 4); ``film`` = tangents of the half angles and film offset; image size."""
-
-    to_world: NDArray[np.float64]
-    film: NDArray[np.float64]
-    width: int
-    height: int
-
-
-# --- the slab --------------------------------------------------------------------------------------------------------
+Fibers scatter into narrow lobes: at most vertices next to nothing goes towards a lamp, and the few that matter make the
+noise. So the rays that are saved here (nine of ten) cost hardly any variance.
+"""
 
 
 @njit(cache=True)
-def _enter_slab(macro, patches, prim, u, v, dx, dy, dz, t):
-    """The similarity from world to patch at a hit on a fabric, and where the ray enters the slab.
-
-    Returns
-    -------
-    (ok, patch, scale, rotation (9 numbers, rows T, B, N), place in the tile (3), world distance stepped back)
-    """
-    w = 1.0 - u - v
-    patch = int(macro.surfaces[macro.material[prim], 0])
-    table = patches.table[patch]
-    uv = macro.uv[prim]
-    px = table[7] * (w * uv[0, 0] + u * uv[1, 0] + v * uv[2, 0])
-    py = table[7] * (w * uv[0, 1] + u * uv[1, 1] + v * uv[2, 1])
-    g = macro.geometric[prim]
-    n = macro.normals[prim]
-    nx = w * n[0, 0] + u * n[1, 0] + v * n[2, 0]
-    ny = w * n[0, 1] + u * n[1, 1] + v * n[2, 1]
-    nz = w * n[0, 2] + u * n[1, 2] + v * n[2, 2]
-    norm = math.sqrt(nx * nx + ny * ny + nz * nz)
-    side = dx * g[0] + dy * g[1] + dz * g[2]
-    if norm > 0.0:
-        nx, ny, nz = nx / norm, ny / norm, nz / norm
-    # The interpolated normal must see the ray from the same side as the triangle does, and not at a grazing angle.
-    across = dx * nx + dy * ny + dz * nz
-    if norm <= 0.0 or across * side <= 0.0 or abs(across) < 0.02:
-        nx, ny, nz, across = g[0], g[1], g[2], side
-    tangent = macro.tangents[prim]
-    tx = w * tangent[0, 0] + u * tangent[1, 0] + v * tangent[2, 0]
-    ty = w * tangent[0, 1] + u * tangent[1, 1] + v * tangent[2, 1]
-    tz = w * tangent[0, 2] + u * tangent[1, 2] + v * tangent[2, 2]
-    dot = tx * nx + ty * ny + tz * nz
-    tx, ty, tz = tx - dot * nx, ty - dot * ny, tz - dot * nz
-    norm = math.sqrt(tx * tx + ty * ty + tz * tz)
-    ok = norm > 1e-12 and abs(across) > 1e-5
-    if not ok:
-        tx, ty, tz, norm = 1.0, 0.0, 0.0, 1.0
-    tx, ty, tz = tx / norm, ty / norm, tz / norm
-    sign = macro.sign[prim]
-    bx, by, bz = sign * (ny * tz - nz * ty), sign * (nz * tx - nx * tz), sign * (nx * ty - ny * tx)
-
-    scale = table[7] * macro.scale[prim]
-    # Step back from the mid-surface to the side of the slab that the ray comes from.
-    border = table[3] if across < 0.0 else -table[2]
-    thickness = table[3] - table[2]
-    back = min(border / (scale * max(abs(across), 1e-9)), t, 20.0 * thickness / scale)
-    along = back * scale
-    lx = px - along * (dx * tx + dy * ty + dz * tz)
-    ly = py - along * (dx * bx + dy * by + dz * bz)
-    lz = -along * across
-    lx -= table[0] * math.floor(lx / table[0])
-    ly -= table[1] * math.floor(ly / table[1])
-    return ok, patch, scale, (tx, ty, tz, bx, by, bz, nx, ny, nz), lx, ly, lz, back
-
-
-@njit(cache=True)
-def _step(table, lx, ly, lz, dx, dy, dz):
-    """Distance to the border of the tile or slab, and which: 0 x, 1 y, 2 z."""
-    t, axis = FAR, 2
-    if dz > 0.0:
-        t = (table[3] - lz) / dz
-    elif dz < 0.0:
-        t = (table[2] - lz) / dz
-    t = max(t, 0.0)
-    if dx != 0.0:
-        tx = ((table[0] if dx > 0.0 else 0.0) - lx) / dx
-        if tx < t:
-            t, axis = max(tx, 0.0), 0
-    if dy != 0.0:
-        ty = ((table[1] if dy > 0.0 else 0.0) - ly) / dy
-        if ty < t:
-            t, axis = max(ty, 0.0), 1
-    return t, axis
-
-
-@njit(cache=True)
-def _wrap(table, axis, lx, ly, dx, dy):
-    """Place at the start of the next tile after crossing a border."""
-    if axis == 0:
-        lx = 0.0 if dx > 0.0 else table[0]
-    elif axis == 1:
-        ly = 0.0 if dy > 0.0 else table[1]
-    return lx, ly
-
-
-@njit(cache=True)
-def _trace_slab(world, buffer, patch, lx, ly, lz, dx, dy, dz):
-    """Nearest fiber along a ray in patch space.
-
-    Returns (outcome, distance, place in its tile (3)); on ``HIT`` the hit's other fields are in the buffer.
-    """
-    table = world.patches.table[patch]
-    total, near = 0.0, table[4]
-    for _ in range(MAX_TILES):
-        t, axis = _step(table, lx, ly, lz, dx, dy, dz)
-        if t > near and intersect(
-            world.embree[0], world.patches.handles[patch], buffer, lx, ly, lz, dx, dy, dz, near, t, ARGS_FILTER
-        ):
-            hit = np.float64(buffer[0][TFAR])
-            return HIT, total + hit, lx + hit * dx, ly + hit * dy, lz + hit * dz
-        total += t
-        near = max(near - t, 0.0)
-        lx, ly, lz = lx + t * dx, ly + t * dy, lz + t * dz
-        if axis == 2:
-            break
-        lx, ly = _wrap(table, axis, lx, ly, dx, dy)
-    return (ESCAPED_UP if dz > 0.0 else ESCAPED_DOWN), total, lx, ly, lz
-
-
-@njit(cache=True)
-def _slab_occluded(world, buffer, patch, lx, ly, lz, dx, dy, dz, tmax):
-    """Whether a fiber lies on a ray in patch space before it leaves the slab: (occluded, distance to the exit)."""
-    table = world.patches.table[patch]
-    total, near = 0.0, table[4]
-    for _ in range(MAX_TILES):
-        t, axis = _step(table, lx, ly, lz, dx, dy, dz)
-        end = min(t, tmax - total)
-        if end > near and occluded(
-            world.embree[1], world.patches.handles[patch], buffer, lx, ly, lz, dx, dy, dz, near, end, ARGS_FILTER
-        ):
-            return True, total
-        total += t
-        if total >= tmax:
-            break
-        near = max(near - t, 0.0)
-        lx, ly, lz = lx + t * dx, ly + t * dy, lz + t * dz
-        if axis == 2:
-            break
-        lx, ly = _wrap(table, axis, lx, ly, dx, dy)
-    return False, total
-
-
-@njit(cache=True)
-def _leave_slab(table, scale, across):
-    """World distance by which a ray that leaves a slab steps back along itself, to about the mid-surface.
-
-    Meshes that lie within the cloth's thickness (the body under a garment) are then met, and the cloth's own mesh is
-    skipped up to ``back`` plus twice the thickness.
-    """
-    thickness = table[3] - table[2]
-    return min(max(table[3], -table[2]) / (scale * max(abs(across), 1e-9)), 4.0 * thickness / scale), thickness / scale
-
-
-# --- macro scale -----------------------------------------------------------------------------------------------------
-
-
-@njit(cache=True)
-def _trace_macro(world, buffer, ox, oy, oz, dx, dy, dz, near, tmax, skip_mesh, skip_distance):
-    """Nearest triangle, those of ``skip_mesh`` nearer than ``skip_distance`` left out: (hit, t, prim, u, v)."""
-    for _ in range(MAX_SURFACES):
-        if not intersect(world.embree[0], world.embree[3], buffer, ox, oy, oz, dx, dy, dz, near, tmax, ARGS_PLAIN):
-            return False, tmax, 0, 0.0, 0.0
-        floats, words, _address = buffer
-        t, prim = np.float64(floats[TFAR]), np.int64(words[PRIM])
-        if t < skip_distance and world.macro.mesh[prim] == skip_mesh:
-            near = t * (1.0 + 1e-6) + 1e-9
-            continue
-        return True, t, prim, np.float64(floats[U]), np.float64(floats[V])
-    return False, tmax, 0, 0.0, 0.0
-
-
-@njit(cache=True)
-def _macro_visible(world, buffer, ox, oy, oz, dx, dy, dz, near, tmax, skip_mesh, skip_distance):
-    """Whether light comes through from ``tmax``: surfaces block it, fabrics where a fiber is in the way."""
-    for _ in range(MAX_SURFACES):
-        hit, t, prim, u, v = _trace_macro(world, buffer, ox, oy, oz, dx, dy, dz, near, tmax, skip_mesh, skip_distance)
-        if not hit:
-            return True
-        if world.macro.surfaces[world.macro.material[prim], 0] < 0.0:
-            return False
-        ok, patch, scale, r, lx, ly, lz, back = _enter_slab(world.macro, world.patches, prim, u, v, dx, dy, dz, t)
-        if not ok:
-            return False
-        px = dx * r[0] + dy * r[1] + dz * r[2]
-        py = dx * r[3] + dy * r[4] + dz * r[5]
-        pz = dx * r[6] + dy * r[7] + dz * r[8]
-        blocked, through = _slab_occluded(world, buffer, patch, lx, ly, lz, px, py, pz, (tmax - t + back) * scale)
-        if blocked:
-            return False
-        exit_back, thickness = _leave_slab(world.patches.table[patch], scale, pz)
-        start = t - back + through / scale - exit_back
-        ox, oy, oz = ox + start * dx, oy + start * dy, oz + start * dz
-        tmax -= start
-        near, skip_mesh, skip_distance = 0.0, world.macro.mesh[prim], exit_back + 2.0 * thickness
-        if tmax <= exit_back:
-            return True
-    return False
-
-
-# --- paths -----------------------------------------------------------------------------------------------------------
-
-
-@njit(cache=True)
-def _lambert_sample(nx, ny, nz, u0, u1):
-    """A cosine-distributed direction about a unit normal."""
-    radius, phi = math.sqrt(u0), 2.0 * math.pi * u1
-    a, b, c = radius * math.cos(phi), radius * math.sin(phi), math.sqrt(max(0.0, 1.0 - u0))
+def _shading_frame(nx, ny, nz, gx, gy, gz, hx, hy, hz, mapped, mx, my, mz):
+    """Unit tangent, bitangent and normal for a surface: along the texture coordinates where a normal map needs it."""
+    norm = 1.0 / math.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-300))
+    nx, ny, nz = nx * norm, ny * norm, nz * norm
+    if mapped:
+        # dp/du and dp/dv are the dual basis of the gradients.
+        tx, ty, tz = hy * nz - hz * ny, hz * nx - hx * nz, hx * ny - hy * nx
+        bx, by, bz = ny * gz - nz * gy, nz * gx - nx * gz, nx * gy - ny * gx
+        handed = 1.0 if gx * tx + gy * ty + gz * tz > 0.0 else -1.0
+        tangent = handed / math.sqrt(max(tx * tx + ty * ty + tz * tz, 1e-300))
+        bitangent = handed / math.sqrt(max(bx * bx + by * by + bz * bz, 1e-300))
+        nx, ny, nz = (
+            mx * tangent * tx + my * bitangent * bx + mz * nx,
+            mx * tangent * ty + my * bitangent * by + mz * ny,
+            mx * tangent * tz + my * bitangent * bz + mz * nz,
+        )
+        norm = 1.0 / math.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-300))
+        nx, ny, nz = nx * norm, ny * norm, nz * norm
+    # Duff et al. 2017.
     sign = math.copysign(1.0, nz)
-    k = -1.0 / (sign + nz)
-    m = nx * ny * k
-    x = a * (1.0 + sign * nx * nx * k) + b * m + c * nx
-    y = a * sign * m + b * (sign + ny * ny * k) + c * ny
-    z = -a * sign * nx - b * ny + c * nz
-    return x, y, z
+    a = -1.0 / (sign + nz)
+    b = nx * ny * a
+    return (
+        *(1.0 + sign * nx * nx * a, sign * b, -sign * nx),
+        *(b, sign + ny * ny * a, -ny),
+        *(nx, ny, nz),
+    )
+
+
+@njit(cache=True, inline="always")
+def _to_local(s, x, y, z):
+    return (
+        s[0] * x + s[1] * y + s[2] * z,
+        s[3] * x + s[4] * y + s[5] * z,
+        s[6] * x + s[7] * y + s[8] * z,
+    )
 
 
 @njit(cache=True)
-def _trace_path(world, buffer, stream, ox, oy, oz, dx, dy, dz, max_depth, out):
-    """Radiance along a camera ray. Adds to ``out``: RGB, albedo (3), normal (3), depth, alpha, rays traced."""
+def _tint_at(world, material, prim, u, v, tx, ty):
+    """Factor of the fiber albedo from the mesh's colours and the fabric's albedo map: (r, g, b)."""
+    r = g = b = 1.0
+    macro = world.macro
+    row = macro.tinted[prim]
+    if row >= 0:
+        w = 1.0 - u - v
+        c = macro.tint
+        r = w * c[row, 0, 0] + u * c[row, 1, 0] + v * c[row, 2, 0]
+        g = w * c[row, 0, 1] + u * c[row, 1, 1] + v * c[row, 2, 1]
+        b = w * c[row, 0, 2] + u * c[row, 1, 2] + v * c[row, 2, 2]
+    image = int(macro.fabrics[material, ALBEDO_MAP])
+    if image >= 0:
+        lr, lg, lb = lookup(world.textures, image, tx, ty)
+        r, g, b = r * lr, g * lg, b * lb
+    return r, g, b
+
+
+@njit(cache=True, inline="always")
+def _absorption(sigma, inverse_q, tint, albedo):
+    """Absorption of a fiber whose albedo coefficient is multiplied by ``tint`` (Chiang et al. 2015; at most 1)."""
+    root = math.sqrt(sigma) - math.log(min(max(tint, 1e-4), 1.0 / max(albedo, 1e-4))) * inverse_q
+    return root * root if root > 0.0 else 0.0
+
+
+@njit(cache=True)
+def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, set_ids, out):
+    """Radiance along a camera ray. Adds to ``out``, the film's channels of the pixel."""
     macro, patches, lights = world.macro, world.patches, world.lights
     light_count = len(lights.table)
     beta_r = beta_g = beta_b = 1.0
     total_r = total_g = total_b = 0.0
+    direct_r = direct_g = direct_b = 0.0
     bsdf_pdf = -1.0
+    # Where the BSDF drew the direction: light sampling is judged from there.
+    sx, sy, sz = ox, oy, oz
     in_slab = False
     near, skip_mesh, skip_distance = 0.0, -1, 0.0
-    patch, scale, lx, ly, lz = 0, 1.0, 0.0, 0.0, 0.0
-    r = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    slab_mesh = -1
+    first_patch, variants, patch, up = 0, 1, 0, 1.0
+    lx, ly, lz, ix, iy = 0.0, 0.0, 0.0, np.int64(0), np.int64(0)
+    m = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    inverse = m
+    tinted, tint_r, tint_g, tint_b = False, 1.0, 1.0, 1.0
+    slab_mesh = np.int64(-1)
     first = True
     travelled = 0.0
+    tx = ty = 0.0
 
     for depth in range(1, max_depth + 1):
         # Next interaction: a fiber, a surface, or light.
         fiber = False
         finished = False
-        prim, hu, hv = 0, 0.0, 0.0
+        prim, material, hu, hv, gx, gy, gz = np.int64(0), np.int64(0), 0.0, 0.0, 0.0, 0.0, 1.0
+        frame = m
         for _ in range(MAX_SURFACES):
             if in_slab:
-                px = dx * r[0] + dy * r[1] + dz * r[2]
-                py = dx * r[3] + dy * r[4] + dz * r[5]
-                pz = dx * r[6] + dy * r[7] + dz * r[8]
-                outcome, t, lx, ly, lz = _trace_slab(world, buffer, patch, lx, ly, lz, px, py, pz)
-                out[11] += 1.0
-                t /= scale
+                px, py, pz = to_patch(m, dx, dy, dz)
+                stretch = math.sqrt(px * px + py * py + pz * pz)
+                outcome, t, lx, ly, lz, ix, iy, patch = trace_slab(
+                    world, buffer, first_patch, variants, lx, ly, lz, ix, iy, px / stretch, py / stretch, pz / stretch
+                )
+                out[RAYS] += 1.0
+                t /= stretch
                 travelled += t
                 ox, oy, oz = ox + t * dx, oy + t * dy, oz + t * dz
                 if outcome == HIT:
                     fiber = True
                     break
                 in_slab = False
-                back, thickness = _leave_slab(patches.table[patch], scale, pz)
+                back, thickness = leave_slab(patches, first_patch, up, pz)
                 ox, oy, oz = ox - back * dx, oy - back * dy, oz - back * dz
                 travelled -= back
                 near, skip_mesh, skip_distance = 0.0, slab_mesh, back + 2.0 * thickness
-            hit, t, prim, hu, hv = _trace_macro(
-                world, buffer, ox, oy, oz, dx, dy, dz, near, FAR, skip_mesh, skip_distance
+            hit, t, prim, copy, mesh, hu, hv = trace_macro(
+                world, buffer, time, ox, oy, oz, dx, dy, dz, near, FAR, skip_mesh, skip_distance
             )
-            out[11] += 1.0
-            t_light, er, eg, eb = hit_light(lights, ox, oy, oz, dx, dy, dz, t if hit else FAR, bsdf_pdf)
-            if t_light < (t if hit else FAR):
-                total_r, total_g, total_b = total_r + beta_r * er, total_g + beta_g * eg, total_b + beta_b * eb
-                if first:
-                    out[10] += 1.0
+            out[RAYS] += 1.0
+            t_light, er, eg, eb = hit_light(lights, ox, oy, oz, dx, dy, dz, t if hit else FAR, bsdf_pdf, sx, sy, sz)
+            at_light = t_light < (t if hit else FAR)
+            if not at_light and not hit:
+                er, eg, eb = escaped_radiance(lights, dx, dy, dz, bsdf_pdf, sx, sy, sz)
+            if at_light or not hit:
+                er, eg, eb = beta_r * er, beta_g * eg, beta_b * eb
+                total_r, total_g, total_b = total_r + er, total_g + eg, total_b + eb
+                if depth <= 2:
+                    direct_r, direct_g, direct_b = direct_r + er, direct_g + eg, direct_b + eb
+                if first and at_light:
+                    out[ALPHA] += 1.0
                 finished = True
                 break
-            if not hit:
-                er, eg, eb = escaped_radiance(lights, dx, dy, dz, bsdf_pdf)
-                total_r, total_g, total_b = total_r + beta_r * er, total_g + beta_g * eg, total_b + beta_b * eb
-                finished = True
-                break
-            if macro.surfaces[macro.material[prim], 0] < 0.0:
+            material = np.int64(macro.material[prim])
+            tx, ty, gx, gy, gz, frame = surface_frame(macro, time, prim, copy, hu, hv)
+            faces = dx * gx + dy * gy + dz * gz
+            if macro.fabrics[material, FIRST_PATCH] < 0.0:
+                opacity = opacity_at(world.materials, world.textures, material, tx, ty)
+                if opacity < 1.0:
+                    stream, u0 = next_uniform(stream)
+                    if u0 >= opacity:
+                        near = t * (1.0 + 1e-6) + 1e-9
+                        continue
                 ox, oy, oz = ox + t * dx, oy + t * dy, oz + t * dz
                 travelled += t
                 break
-            ok, patch, scale, r, lx, ly, lz, back = _enter_slab(macro, patches, prim, hu, hv, dx, dy, dz, t)
-            slab_mesh = macro.mesh[prim]
-            in_slab = ok
-            step = t - back if ok else t
+            in_slab, first_patch, variants, m, up, lx, ly, lz, ix, iy, back = enter_slab(
+                macro, patches, material, tx, ty, gx, gy, gz, faces, frame, dx, dy, dz, t
+            )
+            if not in_slab:  # exactly edge-on: the cloth has no area here
+                near, skip_mesh, skip_distance = t * (1.0 + 1e-6) + 1e-9, np.int64(-1), 0.0
+                continue
+            inverse = inverse_columns(m)
+            slab_mesh = mesh
+            tinted = macro.tinted[prim] >= 0 or macro.fabrics[material, ALBEDO_MAP] >= 0.0
+            if tinted:
+                tint_r, tint_g, tint_b = _tint_at(world, material, prim, hu, hv, tx, ty)
+            step = t - back
             ox, oy, oz = ox + step * dx, oy + step * dy, oz + step * dz
             travelled += step
-            if not ok:  # exactly edge-on: the cloth has no area here
-                near, skip_mesh, skip_distance = 0.0, slab_mesh, 1e-6
         else:
             finished = True
         if finished:
@@ -376,55 +208,82 @@ def _trace_path(world, buffer, stream, ox, oy, oz, dx, dy, dz, max_depth, out):
 
         # Shading frame at the interaction.
         floats, words, _address = buffer
+        fiber_material = load_fiber(patches.materials, 0)
+        prepared = prepare_fiber(fiber_material, 0.0, 0.0, 1.0)
+        surface = prepare_surface((0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0), 1.0)
+        shading = m
+        ax = ay = az = ex = ey = ez = fx = fy = fz = 0.0
+        wox = woy = woz = 0.0
         if fiber:
-            table = patches.table[patch]
-            segment = int(table[5]) + np.int64(words[PRIM])
-            vertex = int(table[6]) + patches.segment_vertex[segment]
+            segment = int(patches.table[patch, FIRST_SEGMENT]) + np.int64(words[PRIM])
             s = np.float64(floats[U])
-            a, b = patches.tangents[vertex], patches.tangents[vertex + 1]
-            ax = (1.0 - s) * a[0] + s * b[0]
-            ay = (1.0 - s) * a[1] + s * b[1]
-            az = (1.0 - s) * a[2] + s * b[2]
+            c = patches.segments
+            qx = (1.0 - s) * c[segment, 0] + s * c[segment, 3]
+            qy = (1.0 - s) * c[segment, 1] + s * c[segment, 4]
+            qz = (1.0 - s) * c[segment, 2] + s * c[segment, 5]
+            row = np.int64(c[segment, 6])
+            # Tangents are vectors, normals covectors.
+            ax = qx * inverse[0] + qy * inverse[3] + qz * inverse[6]
+            ay = qx * inverse[1] + qy * inverse[4] + qz * inverse[7]
+            az = qx * inverse[2] + qy * inverse[5] + qz * inverse[8]
             norm = 1.0 / math.sqrt(ax * ax + ay * ay + az * az)
             ax, ay, az = ax * norm, ay * norm, az * norm
-            nx, ny, nz = np.float64(floats[NG]), np.float64(floats[NG + 1]), np.float64(floats[NG + 2])
+            qx, qy, qz = np.float64(floats[NG]), np.float64(floats[NG + 1]), np.float64(floats[NG + 2])
+            nx = qx * m[0] + qy * m[3] + qz * m[6]
+            ny = qx * m[1] + qy * m[4] + qz * m[7]
+            nz = qx * m[2] + qy * m[5] + qz * m[8]
             # Embree's normal belongs to the straight segment; h wants it in the plane normal to the spline's tangent.
             dot = nx * ax + ny * ay + nz * az
             nx, ny, nz = nx - dot * ax, ny - dot * ay, nz - dot * az
-            norm = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
+            norm = 1.0 / math.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-300))
             nx, ny, nz = nx * norm, ny * norm, nz * norm
-            material = load_fiber(patches.materials, patches.segment_material[segment])
-            px = dx * r[0] + dy * r[1] + dz * r[2]
-            py = dx * r[3] + dy * r[4] + dz * r[5]
-            pz = dx * r[6] + dy * r[7] + dz * r[8]
-            sin_to, cos_to, h, ex, ey, ez, fx, fy, fz = fiber_frame(ax, ay, az, nx, ny, nz, -px, -py, -pz)
-            prepared = prepare_fiber(material, h, sin_to, cos_to)
+            fiber_material = load_fiber(patches.materials, row)
+            if tinted:
+                q = patches.albedo[row, 3]
+                fiber_material = (
+                    _absorption(fiber_material[0], q, tint_r, patches.albedo[row, 0]),
+                    _absorption(fiber_material[1], q, tint_g, patches.albedo[row, 1]),
+                    _absorption(fiber_material[2], q, tint_b, patches.albedo[row, 2]),
+                    *fiber_material[3:],
+                )
+            sin_to, cos_to, h, ex, ey, ez, fx, fy, fz = fiber_frame(ax, ay, az, nx, ny, nz, -dx, -dy, -dz)
+            prepared = prepare_fiber(fiber_material, h, sin_to, cos_to)
             if first:
-                colour = patches.albedo[patches.segment_material[segment]]
-                out[3], out[4], out[5] = out[3] + colour[0], out[4] + colour[1], out[5] + colour[2]
-                out[6] += nx * r[0] + ny * r[3] + nz * r[6]
-                out[7] += nx * r[1] + ny * r[4] + nz * r[7]
-                out[8] += nx * r[2] + ny * r[5] + nz * r[8]
+                out[ALBEDO] += min(tint_r * patches.albedo[row, 0], 1.0)
+                out[ALBEDO + 1] += min(tint_g * patches.albedo[row, 1], 1.0)
+                out[ALBEDO + 2] += min(tint_b * patches.albedo[row, 2], 1.0)
+                if set_ids:
+                    out[FIBER_ID] = c[segment, 7]
+                    out[YARN_ID] = patches.yarns[np.int64(c[segment, 7]) - 1]
         else:
-            w = 1.0 - hu - hv
-            n = macro.normals[prim]
-            nx = w * n[0, 0] + hu * n[1, 0] + hv * n[2, 0]
-            ny = w * n[0, 1] + hu * n[1, 1] + hv * n[2, 1]
-            nz = w * n[0, 2] + hu * n[1, 2] + hv * n[2, 2]
-            norm = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
-            g = macro.geometric[prim]
-            side = 1.0 if dx * g[0] + dy * g[1] + dz * g[2] < 0.0 else -1.0
-            nx, ny, nz = nx * norm * side, ny * norm * side, nz * norm * side
-            gx, gy, gz = g[0] * side, g[1] * side, g[2] * side
-            row = macro.surfaces[macro.material[prim]]
-            base_r, base_g, base_b = row[1], row[2], row[3]
-            near, skip_mesh, skip_distance = 1e-6 * (1.0 + travelled), -1, 0.0
+            packed, er, eg, eb = surface_at(world.materials, world.textures, material, tx, ty)
+            mapped, qx, qy, qz = normal_at(world.materials, world.textures, material, tx, ty)
+            side = 1.0 if dx * gx + dy * gy + dz * gz < 0.0 else -1.0
+            er, eg, eb = beta_r * er, beta_g * eg, beta_b * eb
+            total_r, total_g, total_b = total_r + er, total_g + eg, total_b + eb
+            if depth <= 2:
+                direct_r, direct_g, direct_b = direct_r + er, direct_g + eg, direct_b + eb
+            gx, gy, gz = side * gx, side * gy, side * gz
+            shading = _shading_frame(
+                side * frame[0], side * frame[1], side * frame[2], frame[3], frame[4], frame[5], frame[6], frame[7],
+                frame[8], mapped, qx, qy, qz,
+            )  # fmt: skip
+            wox, woy, woz = _to_local(shading, -dx, -dy, -dz)
+            if woz <= 1e-4:
+                # The interpolated normal looks away: the triangle's own does not.
+                shading = _shading_frame(gx, gy, gz, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, False, 0.0, 0.0, 1.0)
+                wox, woy, woz = _to_local(shading, -dx, -dy, -dz)
+            nx, ny, nz = shading[6], shading[7], shading[8]
+            surface = prepare_surface(packed, max(woz, 1e-4))
+            near, skip_mesh, skip_distance = 1e-6 * (1.0 + travelled), np.int64(-1), 0.0
             if first:
-                out[3], out[4], out[5] = out[3] + base_r, out[4] + base_g, out[5] + base_b
-                out[6], out[7], out[8] = out[6] + nx, out[7] + ny, out[8] + nz
+                out[ALBEDO], out[ALBEDO + 1] = out[ALBEDO] + packed[0], out[ALBEDO + 1] + packed[1]
+                out[ALBEDO + 2] += packed[2]
         if first:
-            out[9] += travelled
-            out[10] += 1.0
+            out[NORMAL], out[NORMAL + 1], out[NORMAL + 2] = out[NORMAL] + nx, out[NORMAL + 1] + ny, out[NORMAL + 2] + nz
+            out[DEPTH] += travelled
+            out[ALPHA] += 1.0
+            out[UV], out[UV + 1] = out[UV] + tx, out[UV + 1] + ty
             first = False
         if depth >= max_depth:
             break
@@ -437,85 +296,109 @@ def _trace_path(world, buffer, stream, ox, oy, oz, dx, dy, dz, max_depth, out):
             wx, wy, wz, distance, lr, lg, lb, light_pdf = sample_light(lights, ox, oy, oz, u0, u1, u2)
             if lr > 0.0 or lg > 0.0 or lb > 0.0:
                 if fiber:
-                    qx = wx * r[0] + wy * r[1] + wz * r[2]
-                    qy = wx * r[3] + wy * r[4] + wz * r[5]
-                    qz = wx * r[6] + wy * r[7] + wz * r[8]
-                    sin_ti, cos_ti, phi = fiber_angles(ax, ay, az, ex, ey, ez, fx, fy, fz, qx, qy, qz)
-                    fr, fg, fb, pdf = eval_fiber(material, prepared, sin_ti, cos_ti, phi)
+                    sin_ti, cos_ti, phi = fiber_angles(ax, ay, az, ex, ey, ez, fx, fy, fz, wx, wy, wz)
+                    fr, fg, fb, pdf = eval_fiber(fiber_material, prepared, sin_ti, cos_ti, phi)
                 else:
-                    cos = wx * nx + wy * ny + wz * nz
+                    qx, qy, qz = _to_local(shading, wx, wy, wz)
+                    fr, fg, fb, pdf = eval_surface(surface, qx, qy, qz, wox, woy, woz)
                     if wx * gx + wy * gy + wz * gz <= 0.0:
-                        cos = 0.0
-                    pdf = max(cos, 0.0) / math.pi
-                    fr, fg, fb = base_r * pdf, base_g * pdf, base_b * pdf
-                    qx = qy = qz = 0.0
+                        fr = fg = fb = 0.0
                 weight = 1.0 if light_pdf == 0.0 else light_pdf / (light_pdf + pdf)
                 fr, fg, fb = beta_r * fr * weight, beta_g * fg * weight, beta_b * fb * weight
-                keep = max(fr, fg, fb) * SHADOW
-                if keep < 1.0:
+                likely = max(fr, fg, fb) * SHADOW_ROULETTE
+                if likely < 1.0:
                     stream, u0 = next_uniform(stream)
-                    keep = 1.0 / keep if u0 < keep else 0.0
+                    likely = 1.0 / likely if u0 < likely else 0.0
                 else:
-                    keep = 1.0
-                cr, cg, cb = keep * fr * lr, keep * fg * lg, keep * fb * lb
+                    likely = 1.0
+                cr, cg, cb = likely * fr * lr, likely * fg * lg, likely * fb * lb
                 reach = distance * (1.0 - 1e-6)
                 # Area lights stand in each other's way, as they do for rays that the BSDF draws.
-                if cr + cg + cb > 0.0 and hit_light(lights, ox, oy, oz, wx, wy, wz, reach, -1.0)[0] >= reach:
-                    out[11] += 1.0
+                if cr + cg + cb > 0.0 and not light_blocks(lights, ox, oy, oz, wx, wy, wz, reach):
+                    out[RAYS] += 1.0
+                    share = 1.0
                     if fiber:
-                        blocked, through = _slab_occluded(world, buffer, patch, lx, ly, lz, qx, qy, qz, reach * scale)
-                        visible = not blocked
-                        if visible and through < reach * scale:
-                            back, thickness = _leave_slab(patches.table[patch], scale, qz)
-                            start = through / scale - back
-                            out[11] += 1.0
-                            visible = _macro_visible(
-                                world, buffer, ox + start * wx, oy + start * wy, oz + start * wz, wx, wy, wz,
+                        px, py, pz = to_patch(m, wx, wy, wz)
+                        stretch = math.sqrt(px * px + py * py + pz * pz)
+                        blocked, through = slab_occluded(
+                            world, buffer, first_patch, variants, lx, ly, lz, ix, iy, px / stretch, py / stretch,
+                            pz / stretch, reach * stretch,
+                        )  # fmt: skip
+                        share = 0.0 if blocked else 1.0
+                        if not blocked and through < reach * stretch:
+                            back, thickness = leave_slab(patches, first_patch, up, pz)
+                            start = through / stretch - back
+                            out[RAYS] += 1.0
+                            share = transmittance(
+                                world, buffer, time, ox + start * wx, oy + start * wy, oz + start * wz, wx, wy, wz,
                                 0.0, reach - start, slab_mesh, back + 2.0 * thickness,
                             )  # fmt: skip
                     else:
-                        visible = _macro_visible(world, buffer, ox, oy, oz, wx, wy, wz, near, reach, -1, 0.0)
-                    if visible:
-                        total_r, total_g, total_b = total_r + cr, total_g + cg, total_b + cb
+                        share = transmittance(world, buffer, time, ox, oy, oz, wx, wy, wz, near, reach, np.int64(-1), 0.0)
+                    cr, cg, cb = share * cr, share * cg, share * cb
+                    total_r, total_g, total_b = total_r + cr, total_g + cg, total_b + cb
+                    if depth == 1:
+                        direct_r, direct_g, direct_b = direct_r + cr, direct_g + cg, direct_b + cb
 
         # Next direction: BSDF sampling.
+        sx, sy, sz = ox, oy, oz
         stream, u0 = next_uniform(stream)
         stream, u1 = next_uniform(stream)
+        stream, u2 = next_uniform(stream)
         if fiber:
-            stream, u2 = next_uniform(stream)
             stream, u3 = next_uniform(stream)
-            sin_ti, cos_ti, phi, wr, wg, wb, bsdf_pdf = sample_fiber(material, prepared, u0, u1, u2, u3)
-            px, py, pz = fiber_direction(ax, ay, az, ex, ey, ez, fx, fy, fz, sin_ti, cos_ti, phi)
-            dx = px * r[0] + py * r[3] + pz * r[6]
-            dy = px * r[1] + py * r[4] + pz * r[7]
-            dz = px * r[2] + py * r[5] + pz * r[8]
+            sin_ti, cos_ti, phi, wr, wg, wb, bsdf_pdf = sample_fiber(fiber_material, prepared, u0, u1, u2, u3)
+            dx, dy, dz = fiber_direction(ax, ay, az, ex, ey, ez, fx, fy, fz, sin_ti, cos_ti, phi)
         else:
-            dx, dy, dz = _lambert_sample(nx, ny, nz, u0, u1)
-            bsdf_pdf = max(dx * nx + dy * ny + dz * nz, 0.0) / math.pi
+            qx, qy, qz, wr, wg, wb, bsdf_pdf = sample_surface(surface, wox, woy, woz, u0, u1, u2)
+            dx = qx * shading[0] + qy * shading[3] + qz * shading[6]
+            dy = qx * shading[1] + qy * shading[4] + qz * shading[7]
+            dz = qx * shading[2] + qy * shading[5] + qz * shading[8]
             if dx * gx + dy * gy + dz * gz <= 0.0:
                 break
-            wr, wg, wb = base_r, base_g, base_b
         beta_r, beta_g, beta_b = beta_r * wr, beta_g * wg, beta_b * wb
         if bsdf_pdf <= 0.0 or beta_r + beta_g + beta_b <= 0.0:
             break
         if depth >= RUSSIAN_ROULETTE_DEPTH:
-            survive = min(0.95, RRK * max(beta_r, beta_g, beta_b))
+            survive = min(0.95, max(beta_r, beta_g, beta_b))
             stream, u0 = next_uniform(stream)
             if u0 >= survive:
                 break
             beta_r, beta_g, beta_b = beta_r / survive, beta_g / survive, beta_b / survive
     out[0], out[1], out[2] = out[0] + total_r, out[1] + total_g, out[2] + total_b
+    out[DIRECT], out[DIRECT + 1] = out[DIRECT] + direct_r, out[DIRECT + 1] + direct_g
+    out[DIRECT + 2] += direct_b
     return total_r, total_g, total_b
 
 
 @njit(cache=True)
-def _borrowed(world):
-    """The world with arrays that are not reference-counted."""
-    m, p, l = world.macro, world.patches, world.lights
-    macro = Macro(borrow(m.points), borrow(m.geometric), borrow(m.normals), borrow(m.tangents), borrow(m.uv), borrow(m.scale), borrow(m.sign), borrow(m.material), borrow(m.mesh), borrow(m.surfaces))
-    patches = Patches(borrow(p.table), borrow(p.handles), borrow(p.tangents), borrow(p.segment_vertex), borrow(p.segment_material), borrow(p.materials), borrow(p.albedo))
-    lights = Lights(borrow(l.table), borrow(l.image), borrow(l.rows), borrow(l.columns))
-    return World(macro, patches, lights, world.embree)
+def _camera_ray(view, time, s, t, u1, u2):
+    """Start and direction of the ray through film position (s, t) in [-1, 1]^2, in the world."""
+    x, y = view.film[0] * (s + view.film[2]), view.film[1] * (t + view.film[3])
+    ox = oy = 0.0
+    z = -1.0
+    if view.lens[0] > 0.0:
+        radius, phi = view.lens[0] * math.sqrt(u1), 2.0 * math.pi * u2
+        ox, oy = radius * math.cos(phi), radius * math.sin(phi)
+        x, y, z = view.lens[1] * x - ox, view.lens[1] * y - oy, -view.lens[1]
+    norm = 1.0 / math.sqrt(x * x + y * y + z * z)
+    x, y, z = x * norm, y * norm, z * norm
+    m = view.to_world
+    a, b = (1.0 - time, time) if view.moves else (1.0, 0.0)
+    px, py, pz = a * m[0, 0, 3] + b * m[1, 0, 3], a * m[0, 1, 3] + b * m[1, 1, 3], a * m[0, 2, 3] + b * m[1, 2, 3]
+    dx = dy = dz = 0.0
+    for k in range(2):
+        w = a if k == 0 else b
+        if w == 0.0:
+            continue
+        dx += w * (m[k, 0, 0] * x + m[k, 0, 1] * y + m[k, 0, 2] * z)
+        dy += w * (m[k, 1, 0] * x + m[k, 1, 1] * y + m[k, 1, 2] * z)
+        dz += w * (m[k, 2, 0] * x + m[k, 2, 1] * y + m[k, 2, 2] * z)
+        px += w * (m[k, 0, 0] * ox + m[k, 0, 1] * oy)
+        py += w * (m[k, 1, 0] * ox + m[k, 1, 1] * oy)
+        pz += w * (m[k, 2, 0] * ox + m[k, 2, 1] * oy)
+    norm = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
+    return px, py, pz, dx * norm, dy * norm, dz * norm
 
 
 @njit(cache=True, nogil=True)
@@ -535,10 +418,9 @@ def render_tile(world, view, seed, window, first_sample, samples, max_depth, fil
         Sums of the squares of RGB.
     """
     width, height = view.width, view.height
-    m = view.to_world
     memory = new_ray_buffer(world.embree[2])
     buffer = (borrow(memory[0]), borrow(memory[1]), memory[2])
-    world = _borrowed(world)
+    world = borrowed(world)
     for row in range(window[1], window[3]):
         for column in range(window[0], window[2]):
             pixel = row * width + column
@@ -546,25 +428,26 @@ def render_tile(world, view, seed, window, first_sample, samples, max_depth, fil
             shift = mix(np.uint64(pixel) + mix(np.uint64(seed)))
             shift_x = np.float64(shift >> np.uint64(40)) * 2.0**-24
             shift_y = np.float64((shift >> np.uint64(16)) & np.uint64(0xFFFFFF)) * 2.0**-24
-            out = film[row - window[1], column - window[0]]
-            square = squares[row - window[1], column - window[0]]
+            out = borrow(film[row - window[1], column - window[0]])
+            square = borrow(squares[row - window[1], column - window[0]])
             for sample in range(first_sample, first_sample + samples):
                 jx = shift_x + 0.7548776662466927 * (sample + 1)
                 jy = shift_y + 0.5698402909980532 * (sample + 1)
                 s = 2.0 * (column + jx - math.floor(jx)) / width - 1.0
                 t = 1.0 - 2.0 * (row + jy - math.floor(jy)) / height
-                x = view.film[0] * (s + view.film[2])
-                y = view.film[1] * (t + view.film[3])
-                norm = 1.0 / math.sqrt(x * x + y * y + 1.0)
-                x, y, z = x * norm, y * norm, -norm
-                dx = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z
-                dy = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z
-                dz = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
                 stream = start_stream(seed, pixel, sample)
+                time = u1 = u2 = 0.0
+                if view.moves:
+                    stream, time = next_uniform(stream)
+                if view.lens[0] > 0.0:
+                    stream, u1 = next_uniform(stream)
+                    stream, u2 = next_uniform(stream)
+                ox, oy, oz, dx, dy, dz = _camera_ray(view, time, s, t, u1, u2)
                 red, green, blue = _trace_path(
-                    world, buffer, stream, m[0, 3], m[1, 3], m[2, 3], dx, dy, dz, max_depth, out
+                    world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, sample == 0, out
                 )
                 out[SAMPLES] += 1.0
                 square[0] += red * red
                 square[1] += green * green
                 square[2] += blue * blue
+    memory[1][0] = np.uint32(0)  # Numba frees an array after its last use: this is after the last ray

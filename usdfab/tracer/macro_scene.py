@@ -1,56 +1,136 @@
-"""The macro scale: meshes as one Embree scene, with what the kernels need at each corner."""
+"""The macro scale: meshes and their placed copies as one Embree scene, with what the kernels need at each corner."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
-from usdfab.tracer.embree import EmbreeScene, triangle_scene
+from usdfab.tracer.embree import EmbreeScene, add_triangles
+from usdfab.tracer.world import FABRIC_COLUMNS, Macro
 from usdfab.usd.scene import Mesh, Scene
 
 
-class Macro(NamedTuple):
-    """Triangles of all meshes, arrays over T triangles. World space, metres.
+class Tiles(NamedTuple):
+    """Where a fabric's tiles are: row of the first in ``Patches.table``, number of variants."""
 
-    ``points``, ``normals``, ``tangents`` (T, 3, 3) and ``uv`` (T, 3, 2) belong to corners. ``tangents`` point where the
-    patch's x axis (weft) runs; ``uv`` is the place in the patch in metres of cloth. ``scale`` is metres of cloth per
-    metre of world, ``sign`` -1 where uv is mirrored. ``material`` indexes ``surfaces``; ``mesh`` numbers the meshes.
+    first: int
+    variants: int
+
+
+def build_macro(scene: Scene, tiles: Sequence[Tiles], albedo_maps: Sequence[int]) -> tuple[Macro, EmbreeScene]:
+    """Arrays and Embree scene of a scene's meshes.
+
+    Parameters
+    ----------
+    tiles, albedo_maps:
+        For each of ``scene.fabrics``: its tiles; the number of the texture that multiplies its albedo, or -1.
     """
-
-    points: NDArray[np.float64]
-    geometric: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    tangents: NDArray[np.float64]
-    uv: NDArray[np.float64]
-    scale: NDArray[np.float64]
-    sign: NDArray[np.float64]
-    material: NDArray[np.int32]
-    mesh: NDArray[np.int32]
-    surfaces: NDArray[np.float64]
-    """(materials, 4): index of the patch or -1, base colour."""
-
-
-def build_macro(scene: Scene, patch_of_fabric: list[int]) -> tuple[Macro, EmbreeScene, tuple[NDArray, float]]:
-    """Arrays and Embree scene of a scene's meshes, and (centre, half diagonal) of their bounds.
-
-    ``patch_of_fabric`` says which patch each of ``scene.fabrics`` uses.
-    """
-    if not scene.meshes:
+    meshes = scene.meshes
+    if not meshes:
         raise UsdfabError("the stage has no visible mesh", place=scene.path, remedy="add a Mesh or check visibility")
-    parts = [_mesh_arrays(mesh, _uv_scale(scene, mesh), index) for index, mesh in enumerate(scene.meshes)]
-    joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
-    surfaces = np.zeros((len(scene.materials), 4))
-    for row, material in zip(surfaces, scene.materials, strict=True):
-        row[0] = patch_of_fabric[material.fabric] if material.fabric >= 0 else -1.0
-        row[1:] = material.base_color
-    macro = Macro(*joined, surfaces)  # type: ignore[call-arg]
-    points = macro.points.reshape(-1, 3)
-    low, high = points.min(axis=0), points.max(axis=0)
-    embree = triangle_scene(points, np.arange(len(points)).reshape(-1, 3))
-    return macro, embree, (0.5 * (low + high), float(0.5 * np.linalg.norm(high - low)))
+    keys = 2 if any(m.points_close is not None or m.placements_close is not None for m in meshes) else 1
+    parts = [_mesh_arrays(mesh, _uv_scale(scene, mesh), keys) for mesh in meshes]
+    first = np.r_[0, np.cumsum([len(m.triangles) for m in meshes])]
+    fabrics = np.full((len(scene.materials), FABRIC_COLUMNS), -1.0)
+    for row, material in zip(fabrics, scene.materials, strict=True):
+        if material.fabric >= 0:
+            own = tiles[material.fabric]
+            row[:] = own.first, own.variants, scene.fabrics[material.fabric].meters_per_uv, albedo_maps[material.fabric]
+    tinted, tint = _tints(meshes)
+    embree, placements, copies, bounds = _build(meshes, keys, first)
+    macro = Macro(
+        corners=np.concatenate([p[0] for p in parts], axis=1),
+        faces=np.concatenate([p[1] for p in parts], axis=1),
+        uv=np.concatenate([p[2] for p in parts]),
+        tint=tint,
+        tinted=tinted,
+        material=np.concatenate([m.face_material for m in meshes]).astype(np.int32),
+        mesh=np.repeat(np.arange(len(meshes)), np.diff(first)).astype(np.int32),
+        fabrics=fabrics,
+        placements=placements,
+        first=copies,
+        bounds=bounds,
+        meshes=len(meshes),
+    )
+    return macro, embree
+
+
+def _build(
+    meshes: Sequence[Mesh], keys: int, first: NDArray
+) -> tuple[EmbreeScene, NDArray[np.float64], NDArray[np.int32], NDArray[np.float64]]:
+    """(scene, placements (keys, I, 3, 4), first triangle of each copy (I,), bounds (2, 3)).
+
+    Copies come first in the scene, then one geometry of all triangles that lie in the world.
+    """
+    scene = EmbreeScene()
+    placements, copies, clouds = [], [], []
+    for mesh, start in zip(meshes, first[:-1], strict=True):
+        if mesh.placements is None:
+            continue
+        points = _points(mesh, keys)
+        prototype = EmbreeScene()
+        # A prototype that moves in itself and is placed at several times: Embree blends both.
+        add_triangles(prototype, points, mesh.triangles)
+        prototype.commit()
+        close = mesh.placements if mesh.placements_close is None else mesh.placements_close
+        placed = np.stack([mesh.placements, close][:keys])
+        corners = _box(points)
+        for k in range(placed.shape[1]):
+            scene.add_instance(prototype, placed[:, k])
+            for matrix in placed[:, k]:
+                clouds.append(corners @ matrix[:, :3].T + matrix[:, 3])
+        placements.append(placed)
+        copies.append(np.full(placed.shape[1], start, dtype=np.int32))
+    here = [(m, s) for m, s in zip(meshes, first[:-1], strict=True) if m.placements is None]
+    if here:
+        # Triangles of meshes with copies keep their numbers: they are left without area, which Embree skips.
+        triangles = np.zeros((int(first[-1]), 3), dtype=np.int64)
+        points, base = [np.zeros((keys, 1, 3))], 1
+        for mesh, start in here:
+            triangles[start : start + len(mesh.triangles)] = mesh.triangles + base
+            points.append(_points(mesh, keys))
+            clouds.append(_box(points[-1]))
+            base += len(mesh.points)
+        add_triangles(scene, np.concatenate(points, axis=1), triangles)
+    cloud = np.concatenate(clouds)
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    margin = 1e-5 * float(np.abs(np.r_[low, high, high - low]).max()) + 1e-9
+    return (
+        scene.commit(),
+        np.concatenate([np.zeros((keys, 0, 3, 4)), *placements], axis=1),
+        np.concatenate([np.zeros(0, dtype=np.int32), *copies]),
+        np.stack([low - margin, high + margin]),
+    )
+
+
+def _points(mesh: Mesh, keys: int) -> NDArray[np.float64]:
+    """(keys, V, 3)."""
+    close = mesh.points if mesh.points_close is None else mesh.points_close
+    return np.stack([mesh.points, close][:keys])
+
+
+def _box(points: NDArray) -> NDArray[np.float64]:
+    """(8, 3) corners of the box around points (keys, V, 3)."""
+    ends = np.stack([points.min(axis=(0, 1)), points.max(axis=(0, 1))])
+    return np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _tints(meshes: Sequence[Mesh]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """(row of the tints or -1 for each triangle, tints (N, 3, 3))."""
+    rows, tints, count = [], [np.ones((0, 3, 3))], 0
+    for mesh in meshes:
+        triangles = len(mesh.triangles)
+        if mesh.albedo is None:
+            rows.append(np.full(triangles, -1))
+        else:
+            rows.append(np.arange(count, count + triangles))
+            tints.append(np.asarray(mesh.albedo))
+            count += triangles
+    return np.concatenate(rows).astype(np.int32), np.concatenate(tints).astype(np.float32)
 
 
 def _uv_scale(scene: Scene, mesh: Mesh) -> NDArray[np.float64]:
@@ -60,40 +140,75 @@ def _uv_scale(scene: Scene, mesh: Mesh) -> NDArray[np.float64]:
     return scales[fabric]  # -1 picks the last entry
 
 
-def _mesh_arrays(mesh: Mesh, uv_scale: NDArray, index: int) -> tuple[NDArray, ...]:
-    corners = mesh.points[mesh.triangles]
-    edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    cross = np.cross(edge1, edge2)
-    double_area = np.linalg.norm(cross, axis=1)
-    proper = double_area > 0.0
-    if not proper.all():  # Embree never reports triangles without area; keep their numbers finite
-        cross[~proper], double_area[~proper] = (0.0, 0.0, 1.0), 1.0
-    geometric = cross / double_area[:, None]
-    normals = np.broadcast_to(geometric[:, None], corners.shape) if mesh.normals is None else mesh.normals
-    count = len(corners)
-    uv = np.zeros((count, 3, 2)) if mesh.uv is None else mesh.uv * uv_scale[:, None, None]
-    du, dv = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    determinant = du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]
-    safe = np.where(np.abs(determinant) > 1e-20, determinant, 1.0)
-    dpdu = (edge1 * dv[:, 1:] - edge2 * du[:, 1:]) / safe[:, None]
-    flat = np.abs(determinant) <= 1e-20
-    dpdu[flat] = edge1[flat]
-    scale = np.where(flat, 1.0, np.sqrt(np.abs(determinant) / double_area))
-    sign = np.where(determinant < 0.0, -1.0, 1.0)
-    tangents = _smooth_tangents(mesh, dpdu, double_area)
-    material = mesh.face_material.astype(np.int32)
-    return corners, geometric, normals, tangents, uv, scale, sign, material, np.full(count, index, dtype=np.int32)
+def _mesh_arrays(
+    mesh: Mesh, uv_scale: NDArray, keys: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
+    """(corners (keys, T, 3, 9), unit normals (keys, T, 3), uv (T, 3, 2)) of one mesh."""
+    count = len(mesh.triangles)
+    raw = np.zeros((count, 3, 2)) if mesh.uv is None else np.asarray(mesh.uv, dtype=float)
+    uv = raw * uv_scale[:, None, None]
+    corners = np.zeros((keys, count, 3, 9), dtype=np.float32)
+    faces = np.zeros((keys, count, 3), dtype=np.float32)
+    opened = None
+    for key, points in enumerate(_points(mesh, keys)):
+        place = points[mesh.triangles]
+        edges = place[:, 1] - place[:, 0], place[:, 2] - place[:, 0]
+        cross = np.cross(*edges)
+        double_area = np.linalg.norm(cross, axis=1)
+        proper = double_area > 0.0
+        if not proper.all():  # Embree never reports triangles without area; keep their numbers finite
+            cross[~proper], double_area[~proper] = (0.0, 0.0, 1.0), 1.0
+        geometric = cross / double_area[:, None]
+        if mesh.normals is None:
+            normals = np.repeat(geometric[:, None], 3, axis=1)
+        elif key == 0:
+            normals = np.asarray(mesh.normals)
+        else:
+            # Authored normals turn as the smooth normals of the points do.
+            assert opened is not None
+            normals = np.asarray(mesh.normals) + _smooth(mesh, cross) - opened
+        if key == 0 and keys == 2 and mesh.normals is not None:
+            opened = _smooth(mesh, cross)
+        faces[key] = geometric
+        corners[key, ..., :3] = normals
+        corners[key, ..., 3:] = _gradients(mesh, edges, geometric, double_area, uv)
+    return corners, faces, raw
 
 
-def _smooth_tangents(mesh: Mesh, dpdu: NDArray, weight: NDArray) -> NDArray[np.float64]:
-    """(T, 3, 3) dp/du at the corners, averaged over the triangles at a vertex unless they disagree (uv seams)."""
-    unit = dpdu / np.maximum(np.linalg.norm(dpdu, axis=1, keepdims=True), 1e-30)
-    if mesh.normals is None:
-        return np.repeat(unit[:, None], 3, axis=1)
+def _smooth(mesh: Mesh, cross: NDArray) -> NDArray[np.float64]:
+    """(T, 3, 3) unit normals at the corners, averaged by area over the triangles at a point."""
     total = np.zeros_like(mesh.points)
     for corner in range(3):
-        np.add.at(total, mesh.triangles[:, corner], unit * weight[:, None])
+        np.add.at(total, mesh.triangles[:, corner], cross)
     smooth = total[mesh.triangles]
-    smooth /= np.maximum(np.linalg.norm(smooth, axis=2, keepdims=True), 1e-30)
-    agrees = np.einsum("tcx,tx->tc", smooth, unit) > 0.7
-    return np.where(agrees[..., None], smooth, unit[:, None])
+    return smooth / np.maximum(np.linalg.norm(smooth, axis=2, keepdims=True), 1e-30)
+
+
+def _gradients(
+    mesh: Mesh, edges: tuple[NDArray, NDArray], normal: NDArray, double_area: NDArray, uv: NDArray
+) -> NDArray[np.float64]:
+    """(T, 3, 6) gradients of the cloth's x and y at the corners, averaged over the triangles at a vertex unless they
+    disagree there (uv seams)."""
+    du, dv = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    # grad f = ((f1 - f0) (e2 x n) + (f2 - f0) (n x e1)) / (2 A) for a linear f on a triangle with e1 x e2 = 2 A n.
+    across = np.cross(edges[1], normal), np.cross(normal, edges[0])
+    gradient = (du[:, :, None] * across[0][:, None] + dv[:, :, None] * across[1][:, None]) / double_area[:, None, None]
+    flat = np.abs(du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]) <= 1e-20
+    if flat.any():  # no Jacobian: the cloth lies there along the first edge, in its own size
+        along = edges[0][flat] / np.maximum(np.linalg.norm(edges[0][flat], axis=1, keepdims=True), 1e-30)
+        gradient[flat] = np.stack([along, np.cross(normal[flat], along)], axis=1)
+    gradient = gradient.reshape(-1, 6)
+    if mesh.normals is None:
+        return np.repeat(gradient[:, None], 3, axis=1)
+    total = np.zeros((len(mesh.points), 7))
+    weighted = np.c_[gradient, np.ones(len(gradient))] * double_area[:, None]
+    for corner in range(3):
+        np.add.at(total, mesh.triangles[:, corner], weighted)
+    smooth = (total[:, :6] / np.maximum(total[:, 6:], 1e-30))[mesh.triangles]
+    agrees = np.ones(smooth.shape[:2], dtype=bool)
+    for part in (slice(0, 3), slice(3, 6)):
+        a, b = smooth[..., part], gradient[:, None, part]
+        scale = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
+        agrees &= np.sum(a * b, axis=-1) > 0.7 * scale
+        agrees &= np.linalg.norm(a, axis=-1) > 0.7 * np.linalg.norm(b, axis=-1)
+    return np.where(agrees[..., None], smooth, gradient[:, None])
