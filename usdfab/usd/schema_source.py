@@ -10,12 +10,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from usdfab.fabric.fabric import SIZE_RANGE
+from usdfab.fabric.fabric import SIZE_RANGE, VARIANTS_RANGE
 from usdfab.fabric.parameters import YARN_PARAMETERS, Parameter
 from usdfab.fabric.weave import MAX_REPEAT
 from usdfab.usd.registration import FABRIC_API, YARN_API
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 NAMESPACE = "usdfab"
 YARN_NAMESPACE = f"{NAMESPACE}:yarn"
 _TYPES = {"float": "double", "int": "int", "color": "color3d", "colors": "color3d[]"}
@@ -128,6 +128,11 @@ FABRIC_ATTRIBUTES: tuple[SchemaAttribute, ...] = (
     SchemaAttribute(
         "seed", "seed", "int", 0, "0", "Seed", "Fabric",
         "Fixes every random draw of the fibers.\nUnits: dimensionless\nRange: [0, 2147483647]", (0, 2**31 - 1),
+    ),
+    SchemaAttribute(
+        "variants", "variants", "int", 4, "4", "Variants", "Fabric",
+        "How many variants of the repeating tile a renderer mixes, so that the eye finds no repetition; 1 is off.\n"
+        f"Units: dimensionless\nRange: {_range_doc(*VARIANTS_RANGE)}", VARIANTS_RANGE,
     ),
     SchemaAttribute(
         "metersPerUv", "", "double", 0.0, "0", "Metres per uv (m)", "Fabric",
