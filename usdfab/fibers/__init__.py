@@ -1,9 +1,9 @@
 """Fiber geometry from fabric parameters: centre line, cross-section, noise, yarns, periodic patch."""
 
+from usdfab.fibers.draws import Draws as Draws, Variation as Variation, draw as draw, variation as variation
 from usdfab.fibers.fibers import (
-    Draws as Draws,
     YarnShape as YarnShape,
-    draw as draw,
+    closed_twist as closed_twist,
     fiber_offsets as fiber_offsets,
     successors as successors,
 )

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, System
-from usdfab.fibers.fibers import YarnShape, draw, fiber_offsets, successors
+from usdfab.fibers.draws import draw
+from usdfab.fibers.fibers import YarnShape, fiber_offsets, successors
 from usdfab.fibers.segments import Layout, lay_out
 
 PATH_TRACING_VERTICES = 40
@@ -140,7 +141,7 @@ def generate_patch(
     for name in ("warp", "weft"):
         yarn = fabric.system(name)
         layout = lay_out(weave, name, vertices_per_segment)
-        draws = draw(layout, yarn.fiber_count, fabric.seed)
+        draws = draw(layout, yarn.fiber_count, fabric.seed, yarn.ply_count)
         shape = YarnShape.of(yarn)
         successor = successors(shape, layout, draws)
         across, height = fiber_offsets(shape, layout, draws, successor)
