@@ -121,9 +121,9 @@ YARN_PARAMETERS: tuple[Parameter, ...] = (
     ),
     Parameter(
         "ply_twist", "alpha_ply", "turns/cell", "float", -0.05, (-4.0, 4.0), (-0.6, 0.6),
-        "Turns of the fibers about their ply's axis for each crossing passed, seen from the yarn and not from the turning "
-        "ply; positive is Z twist. Used only where ply_count is above 1. Plies are usually twisted against their fibers: "
-        "-twist lays the fibers on the outside of a two-ply yarn along the yarn.",
+        "Turns of the fibers about their ply's axis for each crossing passed, in a frame that does not turn with the "
+        "ply; positive is Z twist. Used only where ply_count is above 1. Plies are usually twisted against their "
+        "fibers: -twist lays the fibers on the outside of a two-ply yarn along the yarn.",
     ),
     Parameter(
         "irregularity", "Q", "1", "float", 0.15, (0.0, 1.0), (0.0, 0.6),
@@ -152,7 +152,7 @@ YARN_PARAMETERS: tuple[Parameter, ...] = (
         "Share of the flyaways that are loops, which leave the yarn and return; the others are hairs with a free end.",
     ),
     Parameter(
-        "flyaway_length", "l_fly", "m", "float", 4e-4, (1e-6, 1e-1), (5e-5, 3e-3),
+        "flyaway_length", "l_fly", "m", "float", 4e-4, (1e-6, 2e-2), (5e-5, 3e-3),
         "Mean length of a flyaway outside the yarn, measured along it, in metres.",
     ),
     Parameter(

@@ -9,7 +9,7 @@ def ply_circles(count: int) -> tuple[float, float]:
     """Radius of each ply, and distance of its centre from the yarn's axis, both in yarn radii.
 
     The ``count`` equal circles touch the yarn's circle from inside and, from two plies on, their two neighbours:
-    with ``s = sin(pi / count)``, ``distance = 1 / (1 + s)`` and ``radius = s / (1 + s)``. One ply fills the yarn: (1, 0).
+    with ``s = sin(pi / count)``, ``distance = 1 / (1 + s)`` and ``radius = s / (1 + s)``. One ply fills the yarn.
     """
     if count < 2:
         return 1.0, 0.0

@@ -7,11 +7,13 @@ from usdfab.fibers.fibers import (
     fiber_offsets as fiber_offsets,
     successors as successors,
 )
+from usdfab.fibers.flyaways import OpenCurves as OpenCurves
 from usdfab.fibers.patch import (
     PATH_TRACING_VERTICES as PATH_TRACING_VERTICES,
     RASTERIZATION_VERTICES as RASTERIZATION_VERTICES,
     FiberSystem as FiberSystem,
     Patch as Patch,
     generate_patch as generate_patch,
+    patch_variants as patch_variants,
 )
 from usdfab.fibers.segments import Layout as Layout, lay_out as lay_out

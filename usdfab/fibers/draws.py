@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from usdfab.fabric import SYSTEMS
-from usdfab.fibers.cross_section import JITTER
+from usdfab.fabric import SYSTEMS, ply_circles
+from usdfab.fibers.cross_section import JITTER, fiber_radius
 from usdfab.fibers.randomness import hash_integers, normal, uniform
 from usdfab.fibers.segments import Layout
 
@@ -109,8 +109,9 @@ def smoother_step(t: Floats) -> Floats:
 
 def ramp(layout: Layout) -> tuple[float, float]:
     """Cells at both ends of a yarn in which all variants agree, and cells over which they depart from each other."""
-    inner = np.diff(layout.position)[np.diff(layout.yarn) == 0]
-    band = max(BORDER_BAND, 3.0 * float(inner.max(initial=layout.length)))
+    # A yarn interlaces, so that it has two segments at least and many stations.
+    spacing = float(np.diff(layout.position)[np.diff(layout.yarn) == 0].max())
+    band = max(BORDER_BAND, 3.0 * spacing)
     return band, min(RAMP, 0.5 * layout.length - band)
 
 
@@ -123,22 +124,43 @@ def variation_weight(layout: Layout) -> Floats:
     return smoother_step((border - band) / width)
 
 
-def variation(layout: Layout, draws: Draws, seed: int, variant: int, mask: Floats) -> Variation:
-    """The changes of variant ``variant`` (1, 2, ...) for the curves that ``mask`` (yarns, fibers) lets vary."""
+def reach(draws: Draws, jitter: Floats) -> Floats:
+    """(yarns, fibers) how far fibers get from the yarn's axis at most, in yarn radii, with the given ``jitter``."""
+    radius, distance = ply_circles(draws.plies)
+    place = np.arange(draws.fibers) // draws.plies + 1.0
+    return distance + radius * np.abs(fiber_radius(place, draws.fibers // draws.plies, jitter))
+
+
+def variation(
+    layout: Layout, draws: Draws, successor: NDArray[np.int64], seed: int, variant: int, room: Floats
+) -> Variation:
+    """The changes of the draws that make variant ``variant`` (1, 2, ...) of the tile.
+
+    Parameters
+    ----------
+    successor: (yarns, fibers)
+        That of the common draws; it stays.
+    room: (yarns,)
+        How far from the yarn's axis a fiber may get that varies, in yarn radii: as far as to the tile's side. A curve
+        that may get further, with the common draws or the variant's, stays as it is.
+    """
     other = draw(layout, draws.fibers, int(hash_integers(seed, _VARIANT, variant) >> np.uint64(33)), draws.plies)
     system = SYSTEMS.index(layout.system)
     yarn = np.arange(layout.yarns)
-    # A cross-section turns as one or not at all.
-    whole = mask.min(axis=1)
-    # The step's steepest slope is 15 / 8.
+    farthest = np.maximum(reach(draws, draws.jitter), reach(draws, other.jitter))
+    # A curve is a blend of its own fiber and its successor.
+    farthest = np.maximum(farthest, np.take_along_axis(farthest, successor, axis=1))
+    mask = (farthest < room[:, None]).astype(float)
+    # The step's steepest slope is 15 / 8. A cross-section turns as one or not at all.
     most = 2.0 * math.pi * MAX_ROTATION_RATE * max(ramp(layout)[1], 0.0) * 8.0 / 15.0
+    rotation = most * mask.min(axis=1) * (2.0 * uniform(seed, system, yarn, variant, _ROTATION) - 1.0)
     return Variation(
         jitter=other.jitter - draws.jitter,
         # The shorter way round, so that no fiber wanders more than it must.
         theta0=np.mod(other.theta0 - draws.theta0 + math.pi, 2.0 * math.pi) - math.pi,
         xi=XI_SHIFT * (other.xi / 50.0 - 1.0),
         kappa=other.kappa - draws.kappa,
-        rotation=most * whole * (2.0 * uniform(seed, system, yarn, variant, _ROTATION) - 1.0),
+        rotation=rotation,
         weight=variation_weight(layout),
         mask=mask,
     )

@@ -70,7 +70,7 @@ class YarnShape:
 
 
 def closed_twist(twist: float, length: int, plies: int, step: int | None = None) -> float:
-    """Turns per cell of the plies about the yarn: the nearest to ``twist`` with which they close after ``length`` cells.
+    """Turns per cell of the plies about the yarn: those nearest to ``twist`` with which they close in ``length`` cells.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ class _Raw:
             self.ply_twist = closed_twist(shape.as_floats().twist, layout.length, draws.plies, step)
 
     def __call__(self, fiber: NDArray, shift: float) -> tuple[Any, Any, Any]:
-        """Across, height and vertical noise in yarn radii of the fibers ``fiber`` (fibers, stations), shifted in cells."""
+        """Across, height and noise in yarn radii of the fibers ``fiber`` (fibers, stations), shifted in cells."""
         xp, layout = self.xp, self.layout
         shape, shape2 = self.shape, fiber.shape
         place = layout.position[None, :] + shift
