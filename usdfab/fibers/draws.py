@@ -107,17 +107,21 @@ def smoother_step(t: Floats) -> Floats:
     return t * t * t * (t * (t * 6.0 - 15.0) + 10.0)
 
 
-def ramp(layout: Layout) -> tuple[float, float]:
-    """Cells at both ends of a yarn in which all variants agree, and cells over which they depart from each other."""
+def ramp(layout: Layout, margin: float) -> tuple[float, float]:
+    """Cells at both ends of a yarn in which all variants agree, and cells over which they depart from each other.
+
+    The pieces of spline that a fiber's vertices shape, three on either side, must not come within ``margin`` cells of
+    the border.
+    """
     # A yarn interlaces, so that it has two segments at least and many stations.
     spacing = float(np.diff(layout.position)[np.diff(layout.yarn) == 0].max())
-    band = max(BORDER_BAND, 3.0 * spacing)
+    band = max(BORDER_BAND, 3.0 * spacing + margin)
     return band, min(RAMP, 0.5 * layout.length - band)
 
 
-def variation_weight(layout: Layout) -> Floats:
-    """(stations,) how much a variant departs from the common draws."""
-    band, width = ramp(layout)
+def variation_weight(layout: Layout, margin: float) -> Floats:
+    """(stations,) how much a variant departs from the common draws; ``margin`` as in ``ramp``."""
+    band, width = ramp(layout, margin)
     if width <= 0.0:
         return np.zeros(len(layout.position))
     border = np.minimum(layout.position, layout.length - layout.position)
@@ -132,7 +136,13 @@ def reach(draws: Draws, jitter: Floats) -> Floats:
 
 
 def variation(
-    layout: Layout, draws: Draws, successor: NDArray[np.int64], seed: int, variant: int, room: Floats
+    layout: Layout,
+    draws: Draws,
+    successor: NDArray[np.int64],
+    seed: int,
+    variant: int,
+    room: Floats,
+    margin: float,
 ) -> Variation:
     """The changes of the draws that make variant ``variant`` (1, 2, ...) of the tile.
 
@@ -143,6 +153,8 @@ def variation(
     room: (yarns,)
         How far from the yarn's axis a fiber may get that varies, in yarn radii: as far as to the tile's side. A curve
         that may get further, with the common draws or the variant's, stays as it is.
+    margin: cells
+        How near to the patch's border along the yarn no fiber may vary.
     """
     other = draw(layout, draws.fibers, int(hash_integers(seed, _VARIANT, variant) >> np.uint64(33)), draws.plies)
     system = SYSTEMS.index(layout.system)
@@ -152,7 +164,7 @@ def variation(
     farthest = np.maximum(farthest, np.take_along_axis(farthest, successor, axis=1))
     mask = (farthest < room[:, None]).astype(float)
     # The step's steepest slope is 15 / 8. A cross-section turns as one or not at all.
-    most = 2.0 * math.pi * MAX_ROTATION_RATE * max(ramp(layout)[1], 0.0) * 8.0 / 15.0
+    most = 2.0 * math.pi * MAX_ROTATION_RATE * max(ramp(layout, margin)[1], 0.0) * 8.0 / 15.0
     rotation = most * mask.min(axis=1) * (2.0 * uniform(seed, system, yarn, variant, _ROTATION) - 1.0)
     return Variation(
         jitter=other.jitter - draws.jitter,
@@ -161,6 +173,6 @@ def variation(
         xi=XI_SHIFT * (other.xi / 50.0 - 1.0),
         kappa=other.kappa - draws.kappa,
         rotation=rotation,
-        weight=variation_weight(layout),
+        weight=variation_weight(layout, margin),
         mask=mask,
     )

@@ -37,7 +37,7 @@ ROOT_DEPTH = 0.8
 EMBEDDED = 0.6
 """Length of each end that lies in the yarn, in yarn radii."""
 
-CURL = 0.9
+CURL = 1.3
 """How far flyaways bend sideways, radians."""
 
 MAX_PER_YARN = 20_000
@@ -196,7 +196,7 @@ def _directions(x: Floats, loop: NDArray[np.bool_], spread: float, key: tuple) -
     bend = [CURL * normal(*key, channel)[:, None] / mode for mode, channel in ((1, 5), (2, 6), (3, 7), (1, 8), (2, 9))]
     wave = [np.sin(math.pi * mode * x) for mode in (1, 2, 3)]
     # Hairs nod a little while they rise; loops go down as they went up.
-    hair = upright * lifting + 0.35 * (bend[3] * wave[0] + bend[4] * wave[1]) * lifting
+    hair = upright * lifting * (1.0 + 0.3 * (bend[3] * wave[0] + bend[4] * wave[1]))
     rise = np.where(loop[:, None], upright * np.sin(2.0 * math.pi * x), hair)
     turn = bend[0] * (1.0 - np.cos(math.pi * x)) / 2.0 + bend[1] * wave[1] / 2.0 + bend[2] * wave[2] / 2.0
     return rise, np.where(loop[:, None], bend[1] * wave[1], turn)

@@ -25,7 +25,7 @@ PATH_TRACING_VERTICES = 40
 RASTERIZATION_VERTICES = 10
 """Vertices per segment for rasterization (Li et al. 2024, section 7.2)."""
 
-FLYAWAY_VERTICES, MIN_FLYAWAY_VERTICES = 0.4, 8
+FLYAWAY_VERTICES, MIN_FLYAWAY_VERTICES = 0.5, 8
 """Vertices on a flyaway, as a share of those on a segment and at least."""
 
 
@@ -200,7 +200,8 @@ class _YarnSystem:
             middle = (np.arange(layout.yarns) + 0.5) * self.across_cell
             room = np.minimum(middle, width - middle) - self.radius - SIDE_BAND * self.across_cell
             half_width = self.yarn.radius * self.yarn.flattening
-            changes = variation(layout, draws, self.successor, self.seed, variant, room / half_width)
+            margin = self.radius / self.along_cell + SIDE_BAND
+            changes = variation(layout, draws, self.successor, self.seed, variant, room / half_width, margin)
         across, height = fiber_offsets(shape, layout, draws, self.successor, variation=changes)
         along = np.broadcast_to(layout.position * self.along_cell, across.shape)
         points = self._placed(along, across, height, layout.yarn)
