@@ -93,8 +93,12 @@ class OpenCurves:
         first, last = self.offsets[:-1], self.offsets[1:] - 1
         before = 2.0 * self.points[first] - self.points[first + 1]
         after = 2.0 * self.points[last] - self.points[last - 1]
-        points = np.insert(self.points, np.r_[first, last + 1], np.concatenate([before, after]), axis=0)
-        return points, self.offsets + 2 * np.arange(len(self.offsets))
+        offsets = self.offsets + 2 * np.arange(len(self.offsets))
+        points = np.empty((offsets[-1], 3))
+        own = np.ones(len(points), dtype=bool)
+        own[offsets[:-1]] = own[offsets[1:] - 1] = False
+        points[own], points[offsets[:-1]], points[offsets[1:] - 1] = self.points, before, after
+        return points, offsets
 
     @cached_property
     def bounds(self) -> tuple[Floats, Floats]:
