@@ -85,6 +85,18 @@ def test_presets_are_clean_and_author_everything(name, tmp_path):
     assert stage.GetRootLayer().customLayerData["usdfab"]["generator"].startswith("usdfab ")
 
 
+def test_files_of_version_1_get_the_defaults_of_what_is_new(tmp_path, fabric):
+    path = write_fabric(fabric, tmp_path / "f.usda")
+    stage = Usd.Stage.Open(str(path))
+    prim = stage.GetPrimAtPath(FABRIC_PATH)
+    prim.GetAttribute("usdfab:schemaVersion").Set(1)
+    new = ("plyCount", "plyTwist", "flyawayDensity", "flyawayLoopFraction", "flyawayLength", "flyawaySpread")
+    for name in ("usdfab:variants", *(f"usdfab:yarn:{s}:{n}" for s in ("warp", "weft") for n in new)):
+        assert prim.RemoveProperty(name)
+    assert read_fabric(stage) == fabric
+    assert fabric.variants == 4 and fabric.warp.ply_count == 1 and fabric.warp.flyaway_density == 0
+
+
 def test_the_material_can_be_referenced(tmp_path, fabric):
     write_fabric(fabric, tmp_path / "f.usda")
     stage = Usd.Stage.CreateNew(str(tmp_path / "cloth.usda"))
