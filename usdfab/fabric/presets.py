@@ -85,10 +85,10 @@ def _taffeta() -> FabricParameters:
 
 
 def _woollen_twill() -> FabricParameters:
-    yarn = dict(per_cm=12, cover=0.95, flattening=1.15, albedo=(0.66, 0.28, 0.25), crimp=0.8, **_PLIED)
+    yarn = dict(per_cm=12, cover=0.95, flattening=1.15, albedo=(0.5, 0.1, 0.09), crimp=0.8, **_PLIED)
     yarn |= {"irregularity": 0.35, "cuticle_tilt": 0.05, "roughness_longitudinal": 0.35, "migration_rate": 1.0}
     yarn |= {"flyaway_density": 9000.0, "flyaway_length": 7e-4, "flyaway_loop_fraction": 0.35}
-    return _fabric("WoollenTwill", "twill_2_2", 5, yarn, yarn | {"per_cm": 11, "albedo": (0.7, 0.32, 0.28)})
+    return _fabric("WoollenTwill", "twill_2_2", 5, yarn, yarn | {"per_cm": 11, "albedo": (0.56, 0.13, 0.11)})
 
 
 def _duck() -> FabricParameters:
