@@ -98,6 +98,9 @@ def test_editing_by_name() -> None:
             "size": "3.6mm",
             "weft.yarn_albedo": "1,0,0;0,1,0",
             "weft.fiber_count": "60",
+            "warp.ply_count": "2",
+            "warp.flyaway_length": "0.4mm",
+            "variants": "2",
         },
     )
     assert fabric.warp.albedo == (0.1, 0.2, 0.5)
@@ -106,6 +109,9 @@ def test_editing_by_name() -> None:
     assert fabric.size == pytest.approx((3.6e-3, 3.6e-3))
     assert fabric.repeat() == (4, 4)
     assert fabric.weft.fiber_count == 60
+    assert (fabric.warp.ply_count, fabric.weft.ply_count) == (2, 1)
+    assert fabric.warp.flyaway_length == pytest.approx(4e-4)
+    assert fabric.variants == as_table(fabric)["variants"] == 2
 
 
 def test_colors_lengthen_the_repeat() -> None:
@@ -125,6 +131,11 @@ def test_colors_lengthen_the_repeat() -> None:
         ("size", "0mm"),
         ("size", "1,2,3"),
         ("seed", "-1"),
+        ("variants", "0"),
+        ("variants", "17"),
+        ("variants", "many"),
+        ("both.ply_count", "5"),
+        ("both.flyaway_density", "-1"),
     ],
 )
 def test_bad_edits_are_refused(key: str, value: str) -> None:

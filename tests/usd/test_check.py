@@ -90,3 +90,15 @@ def test_nvidias_checker_does_look():
     issues = nvidia.ValidationEngine().validate(str(HERE / "bad" / "defaultPrim.usda")).issues()
     logging.disable(logging.NOTSET)
     assert len(issues) > 0
+
+
+def test_files_of_an_older_version_are_clean_without_what_came_later():
+    stage = Usd.Stage.Open(str(HERE / "clean" / "fabric.usda"))
+    prim = stage.GetDefaultPrim().GetChild("Fabric")
+    version = prim.GetAttribute("usdfab:schemaVersion")
+    assert version.Get() == 1 and not prim.GetAttribute("usdfab:variants").HasAuthoredValue()
+    assert check(stage) == []
+    version.Set(2)
+    sites = [i.site for i in check(stage)]
+    assert any("usdfab:variants" in s for s in sites) and any("warp:plyCount" in s for s in sites)
+    assert {i.rule for i in check(stage)} == {"usdfab:authored"}

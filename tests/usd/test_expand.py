@@ -179,6 +179,31 @@ def test_fibers_end_where_their_continuations_begin(cloth, tmp_path, small):
     assert -0.5 * patch.size[1] - 1e-4 < low and high < 0.5 * patch.size[1] + 4e-4
 
 
+def test_flyaways_are_curves_of_their_own(cloth, tmp_path, small):
+    hairy = {"flyaway_density": 5000.0, "flyaway_length": 8e-4, "ply_count": 2}
+    fabric = replace(small, warp=replace(small.warp, **hairy), weft=replace(small.weft, **hairy))
+    path = expand(cloth, tmp_path / "f.usda", fabric, vertices_per_segment=6).path
+    stage = Usd.Stage.Open(str(path))
+    assert check(path) == []
+    names = [c.GetName() for c in stage.GetPrimAtPath(f"{PATCHES}/Prototypes/Patch").GetAllChildren()]
+    assert names == ["Warp", "Weft_0", "Weft_1", "WarpFlyaways", "WeftFlyaways_0", "WeftFlyaways_1"]
+    patch = generate_patch(fabric, 6)
+    curves = UsdGeom.BasisCurves(stage.GetPrimAtPath(f"{PATCHES}/Prototypes/Patch/WarpFlyaways"))
+    warp = patch.flyaways[0]
+    counts = np.asarray(curves.GetCurveVertexCountsAttr().Get())
+    np.testing.assert_array_equal(counts, np.diff(warp.offsets) + 2)
+    # Nothing joins them: they start and end at their own ends.
+    points = np.asarray(curves.GetPointsAttr().Get(), dtype=float) * 0.01
+    first, last = spline_ends(points, counts)
+    centre = np.array([*patch.size, 0.0]) / 2
+    np.testing.assert_allclose(first, warp.points[warp.offsets[:-1]] - centre, atol=1e-9)
+    np.testing.assert_allclose(last, warp.points[warp.offsets[1:] - 1] - centre, atol=1e-9)
+    fiber = np.asarray(UsdGeom.PrimvarsAPI(curves).GetPrimvar("usdfab:fiber").Get())
+    assert fiber.min() == patch.warp.fiber.max() + 1 == 6  # five fibers are rounded up to three in each ply
+    _, instancer = world_transforms(stage)
+    assert np.isfinite(np.array(instancer.GetExtentAttr().Get())).all()
+
+
 def corners(points, faces):
     """Triangles of quads as (T, 3, ...) arrays."""
     f = np.asarray(faces)

@@ -57,8 +57,9 @@ weaves = st.builds(lambda w, name: Weave(w.matrix, name), st.sampled_from(list(N
 provenances = st.builds(Provenance, text, text, text, st.lists(text).map(tuple), st.lists(text).map(tuple))
 side = st.floats(1e-5, 10.0)
 fabrics = st.builds(
-    FabricParameters, weaves, st.tuples(side, side), yarns, yarns, st.integers(0, 2**31 - 1), text, provenances
-)
+    FabricParameters, weaves, st.tuples(side, side), yarns, yarns, st.integers(0, 2**31 - 1), text, provenances,
+    st.integers(1, 16),
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("suffix", [".usda", ".usdc"])
@@ -78,10 +79,22 @@ def test_presets_are_clean_and_author_everything(name, tmp_path):
     stage = Usd.Stage.Open(str(path))
     prim = stage.GetPrimAtPath(FABRIC_PATH)
     names = [n for n in prim.GetPropertyNames() if n.startswith("usdfab:")]
-    assert len(names) == 13 + 2 * len(YARN_PARAMETERS)
+    assert len(names) == 14 + 2 * len(YARN_PARAMETERS)
     assert all(prim.GetAttribute(n).HasAuthoredValue() for n in names)
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
     assert stage.GetRootLayer().customLayerData["usdfab"]["generator"].startswith("usdfab ")
+
+
+def test_files_of_version_1_get_the_defaults_of_what_is_new(tmp_path, fabric):
+    path = write_fabric(fabric, tmp_path / "f.usda")
+    stage = Usd.Stage.Open(str(path))
+    prim = stage.GetPrimAtPath(FABRIC_PATH)
+    prim.GetAttribute("usdfab:schemaVersion").Set(1)
+    new = ("plyCount", "plyTwist", "flyawayDensity", "flyawayLoopFraction", "flyawayLength", "flyawaySpread")
+    for name in ("usdfab:variants", *(f"usdfab:yarn:{s}:{n}" for s in ("warp", "weft") for n in new)):
+        assert prim.RemoveProperty(name)
+    assert read_fabric(stage) == fabric
+    assert fabric.variants == 4 and fabric.warp.ply_count == 1 and fabric.warp.flyaway_density == 0
 
 
 def test_the_material_can_be_referenced(tmp_path, fabric):
@@ -153,6 +166,8 @@ BAD_VALUES = [
     ("usdfab:yarn:warp:yarnAlbedo", [Gf.Vec3d(0.5, math.inf, 0)], "inf is not between"),
     ("usdfab:sampleSize", Gf.Vec2d(0, 1), "a side of 0.0 m"),
     ("usdfab:seed", -1, "-1 is not between"),
+    ("usdfab:variants", 17, "17 is not a whole number from 1 to 16"),
+    ("usdfab:yarn:weft:plyCount", 5, "5 is not between 1 and 4"),
     ("usdfab:weave:matrix", [1, 0, 0], "3 values, the size 4 x 4 asks for 16"),
     ("usdfab:weave:matrix", [1] * 16, "never interlaces"),
     ("usdfab:weave:matrix", [2] * 16, "only 0"),

@@ -89,6 +89,21 @@ def test_big_scenes_lose_vertices_and_say_so(patch, monkeypatch, caplog):
         fiber_scene(patch, tiles=(9, 9))
 
 
+def test_flyaways_are_shown_in_the_colours_of_their_yarns(patch):
+    yarn = YarnParameters(count=10, fiber_count=12, albedo=(0.7, 0.2, 0.1), flyaway_density=2e4, flyaway_spread=0.9)
+    hairy = generate_patch(FabricParameters(warp=yarn, weft=YarnParameters(count=10, fiber_count=12)), 6)
+    (flyaways,) = hairy.flyaways
+    points, offsets = _lines(flyaways, 1)
+    np.testing.assert_array_equal(points, flyaways.points)
+    np.testing.assert_array_equal(offsets, flyaways.offsets)
+    for mode in ("yarn", "albedo"):
+        bare, tubes = fiber_scene(patch, mode), fiber_scene(hairy, mode)
+        assert tubes.n_points > bare.n_points
+        np.testing.assert_array_equal(np.unique(tubes["color"], axis=0), np.unique(bare["color"], axis=0))
+    assert tubes.bounds[5] == pytest.approx(hairy.z_range[1], abs=0.3 * yarn.radius)
+    assert tubes.bounds[5] > 1.2 * bare.bounds[5]
+
+
 def test_thinning_keeps_both_ends(patch):
     whole, offsets = _lines(patch.warp, 1)
     thin, thin_offsets = _lines(patch.warp, 4)

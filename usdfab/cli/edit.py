@@ -22,8 +22,9 @@ def run(
 ) -> None:
     """Change parameters of a fabric and write the result as a new file.
 
-    Names are weave, size, seed, name, and warp., weft. or both. followed by a parameter: count, radius, flattening,
-    fiber_count, fiber_radius, packing, inclination, crimp, twist, irregularity, migration, migration_rate, albedo,
+    Names are weave, size, seed, variants, name, and warp., weft. or both. followed by a parameter: count, radius,
+    flattening, fiber_count, fiber_radius, packing, inclination, crimp, twist, ply_count, ply_twist, irregularity,
+    migration, migration_rate, flyaway_density, flyaway_loop_fraction, flyaway_length, flyaway_spread, albedo,
     yarn_albedo, roughness_longitudinal, roughness_azimuthal, roughness_primary, ior, cuticle_tilt.
 
     Usage examples:

@@ -52,6 +52,7 @@ def _lines(path: str, fabric: Any) -> list[str]:
         f"  density      {0.01 / fabric.cell[0]:.4g} ends/cm, {0.01 / fabric.cell[1]:.4g} picks/cm",
         f"  cover        warp {fabric.cover('warp'):.3g}, weft {fabric.cover('weft'):.3g}",
         f"  seed         {fabric.seed}",
+        f"  variants     {fabric.variants}",
         f"  {'':24}{'warp':>24}  {'weft':>24}",
     ]
     for p in YARN_PARAMETERS:

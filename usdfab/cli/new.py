@@ -31,8 +31,9 @@ def run(
     Parameters
     ----------
     kind:
-        A preset (linen, denim, wool-twill, silk-satin, cotton-sateen, canvas, herringbone, taffeta), a weave (plain,
-        "twill 3/1", "satin 5/2", "basket 2/2", ...), or a weave matrix written bottom row first (10/01).
+        A preset (linen, denim, wool-twill, silk-satin, cotton-sateen, canvas, herringbone, taffeta, woollen-twill,
+        duck), a weave (plain, "twill 3/1", "satin 5/2", "basket 2/2", ...), or a weave matrix written bottom row first
+        (10/01).
     """
     from usdfab.cli.settings import parse_settings
     from usdfab.errors import UsdfabError

@@ -17,6 +17,7 @@ from usdfab.fabric.parameters import (
     YARN_PARAMETERS as YARN_PARAMETERS,
     Parameter as Parameter,
 )
+from usdfab.fabric.plies import ply_circles as ply_circles, ply_fill as ply_fill
 from usdfab.fabric.presets import PRESETS as PRESETS, preset as preset
 from usdfab.fabric.sampling import sample_fabric as sample_fabric
 from usdfab.fabric.weave import (

@@ -11,6 +11,7 @@ import numpy as np
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric.parameters import PARAMETER_BY_NAME, YARN_PARAMETERS, Parameter
+from usdfab.fabric.plies import ply_fill
 from usdfab.fabric.weave import Weave, plain, weave_from_name
 
 Color = tuple[float, float, float]
@@ -18,6 +19,9 @@ System = Literal["warp", "weft"]
 SYSTEMS: tuple[System, System] = ("warp", "weft")
 SIZE_RANGE = (1e-5, 10.0)
 """Shortest and longest side of a sample that is accepted, in metres."""
+
+VARIANTS_RANGE = (1, 16)
+"""Fewest and most variants of the tile that repeats."""
 
 
 def _default(name: str) -> Any:
@@ -43,9 +47,15 @@ class YarnParameters:
     inclination: float = _default("inclination")
     crimp: float = _default("crimp")
     twist: float = _default("twist")
+    ply_count: int = _default("ply_count")
+    ply_twist: float = _default("ply_twist")
     irregularity: float = _default("irregularity")
     migration: float = _default("migration")
     migration_rate: float = _default("migration_rate")
+    flyaway_density: float = _default("flyaway_density")
+    flyaway_loop_fraction: float = _default("flyaway_loop_fraction")
+    flyaway_length: float = _default("flyaway_length")
+    flyaway_spread: float = _default("flyaway_spread")
     albedo: Color = _default("albedo")
     yarn_albedo: tuple[Color, ...] = _default("yarn_albedo")
     roughness_longitudinal: float = _default("roughness_longitudinal")
@@ -64,7 +74,8 @@ class YarnParameters:
         """Fiber radius in metres: the given one, or from the packing of the cross-section."""
         if self.fiber_radius > 0:
             return self.fiber_radius
-        return self.radius * math.sqrt(self.flattening * self.packing / self.fiber_count)
+        filled = self.flattening * self.packing * ply_fill(self.ply_count)
+        return self.radius * math.sqrt(filled / self.fiber_count)
 
     def colors(self) -> tuple[Color, ...]:
         """Albedo of consecutive yarns, repeated in order."""
@@ -97,6 +108,8 @@ class FabricParameters:
         The two yarn systems.
     seed:
         Fixes every random draw of the fibers.
+    variants:
+        How many variants of the repeating tile a renderer mixes, so that the eye finds no repetition; 1 is off.
     """
 
     weave: Weave = field(default_factory=plain)
@@ -106,6 +119,7 @@ class FabricParameters:
     seed: int = 0
     name: str = "Fabric"
     provenance: Provenance = field(default_factory=Provenance)
+    variants: int = 4
 
     def __post_init__(self) -> None:
         if len(self.size) != 2:
@@ -117,6 +131,9 @@ class FabricParameters:
         object.__setattr__(self, "size", (float(self.size[0]), float(self.size[1])))
         if not 0 <= self.seed < 2**31:
             raise UsdfabError(f"{self.seed} is not between 0 and 2^31 - 1", place="seed")
+        fewest, most = VARIANTS_RANGE
+        if self.variants != int(self.variants) or not fewest <= self.variants <= most:
+            raise UsdfabError(f"{self.variants} is not a whole number from {fewest} to {most}", place="variants")
 
     @property
     def cell(self) -> tuple[float, float]:
@@ -201,8 +218,8 @@ def _check_range(parameter: Parameter, number: float, place: str) -> None:
 def edited(fabric: FabricParameters, settings: Mapping[str, str]) -> FabricParameters:
     """``fabric`` with settings such as ``{"warp.albedo": ".1,.2,.5", "weave": "twill 2/2"}`` applied.
 
-    Names: ``weave``, ``size`` (two lengths, in metres or with a unit), ``seed``, ``name``, and ``warp.NAME`` or
-    ``weft.NAME`` or ``both.NAME`` for each row of the parameter table.
+    Names: ``weave``, ``size`` (two lengths, in metres or with a unit), ``seed``, ``variants``, ``name``, and
+    ``warp.NAME`` or ``weft.NAME`` or ``both.NAME`` for each row of the parameter table.
 
     Raises
     ------
@@ -219,10 +236,10 @@ def _edited_once(fabric: FabricParameters, key: str, text: str) -> FabricParamet
         return replace(fabric, weave=weave_from_name(text))
     if key == "size":
         return replace(fabric, size=parse_size(text))
-    if key == "seed":
+    if key in ("seed", "variants"):
         if not text.isdigit():
             raise UsdfabError(f"expected a whole number, got '{text}'", place=key)
-        return replace(fabric, seed=int(text))
+        return replace(fabric, **{key: int(text)})  # type: ignore[arg-type]
     if key == "name":
         return replace(fabric, name=text)
     system, _, name = key.partition(".")
@@ -230,7 +247,7 @@ def _edited_once(fabric: FabricParameters, key: str, text: str) -> FabricParamet
         known = ", ".join(p.name for p in YARN_PARAMETERS)
         raise UsdfabError(
             f"unknown parameter '{key}'",
-            remedy=f"use weave, size, seed, name, or warp., weft. or both. followed by one of: {known}",
+            remedy=f"use weave, size, seed, variants, name, or warp., weft. or both. followed by one of: {known}",
         )
     value = _parse_value(PARAMETER_BY_NAME[name], text, key)
     changes = {s: replace(fabric.system(s), **{name: value}) for s in SYSTEMS if system in (s, "both")}
@@ -298,6 +315,7 @@ def as_table(fabric: FabricParameters) -> dict[str, Any]:
         },
         "size_m": list(fabric.size),
         "seed": fabric.seed,
+        "variants": fabric.variants,
         "warp": yarn(fabric.warp),
         "weft": yarn(fabric.weft),
         "provenance": {

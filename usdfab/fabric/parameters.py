@@ -22,6 +22,7 @@ class Parameter:
 
     ``hard`` is the closed range outside which a value is refused; ``soft`` is where real fabrics lie and what sliders,
     priors and the unconstrained maps of the fit use. ``stages`` names the stages of ``usdfab fit`` that estimate it.
+    ``since`` is the version of the USD schema that brought it.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Parameter:
     stages: tuple[str, ...] = ()
     group: str = "Geometry"
     paper: PerWeave | None = None
+    since: int = 1
 
 
 def _both(plain: Distribution, twill0: Distribution, twill1: Distribution, satin: Distribution) -> PerWeave:
@@ -90,7 +92,8 @@ YARN_PARAMETERS: tuple[Parameter, ...] = (
     ),
     Parameter(
         "packing", "packing", "1", "float", 0.35, (0.01, 1.0), (0.2, 0.7),
-        "Fraction of the yarn's cross-section that is filled by fibers; used only where fiber_radius is 0.",
+        "Fraction of the yarn's cross-section (of its plies' where it has several) that is filled by fibers; used only "
+        "where fiber_radius is 0.",
     ),
     Parameter(
         "inclination", "u_max", "rad", "float", 0.6, (0.01, 1.57), (0.1, 1.5),
@@ -107,9 +110,24 @@ YARN_PARAMETERS: tuple[Parameter, ...] = (
     ),
     Parameter(
         "twist", "alpha", "turns/cell", "float", 0.05, (-4.0, 4.0), (-0.3, 0.3),
-        "Turns of the fibers about the yarn for each crossing passed; positive is Z twist, negative is S twist.",
+        "Turns of the fibers about the yarn for each crossing passed; positive is Z twist, negative is S twist. Where "
+        "ply_count is above 1: turns of the plies about the yarn, rounded to what lets the plies close over the patch.",
         ("analysis", "network", "raster"),
         paper=_all(Normal(0, 0.03), Normal(0, 0.01)),
+    ),
+    Parameter(
+        "ply_count", "n_ply", "1", "int", 1, (1, 4), (1, 4),
+        "Number of plies that the yarn is twisted from, each a bundle of fibers of its own; 1 is a single yarn. The "
+        "plies' circles touch each other and the yarn's circle from inside; all hold equally many fibers, fiber_count "
+        "being rounded up.",
+        since=2,
+    ),
+    Parameter(
+        "ply_twist", "alpha_ply", "turns/cell", "float", -0.05, (-4.0, 4.0), (-0.6, 0.6),
+        "Turns of the fibers about their ply's axis for each crossing passed, in a frame that does not turn with the "
+        "ply; positive is Z twist. Used only where ply_count is above 1. Plies are usually twisted against their "
+        "fibers: -twist lays the fibers on the outside of a two-ply yarn along the yarn.",
+        since=2,
     ),
     Parameter(
         "irregularity", "Q", "1", "float", 0.15, (0.0, 1.0), (0.0, 0.6),
@@ -128,6 +146,26 @@ YARN_PARAMETERS: tuple[Parameter, ...] = (
         "Wanderings of a fiber for each turn of twist (Li et al. 2024, eq. 7).",
         ("network",),
         paper=_all(_MIGRATION_RATE, Clamped(Normal(0.2, 0.03), low=0.01, scale=0.8)),
+    ),
+    Parameter(
+        "flyaway_density", "rho_fly", "1/m", "float", 0.0, (0.0, 1e6), (0.0, 2e4),
+        "Flyaways (fibers that stand off the yarn, Zhao et al. 2016) for each metre of yarn.",
+        since=2,
+    ),
+    Parameter(
+        "flyaway_loop_fraction", "p_loop", "1", "float", 0.3, (0.0, 1.0), (0.0, 1.0),
+        "Share of the flyaways that are loops, which leave the yarn and return; the others are hairs with a free end.",
+        since=2,
+    ),
+    Parameter(
+        "flyaway_length", "l_fly", "m", "float", 4e-4, (1e-6, 2e-2), (5e-5, 3e-3),
+        "Mean length of a flyaway outside the yarn, measured along it, in metres.",
+        since=2,
+    ),
+    Parameter(
+        "flyaway_spread", "s_fly", "1", "float", 0.5, (0.0, 1.0), (0.1, 0.9),
+        "How far flyaways stand off: 0 lies along the yarn, 1 stands upright (mean angle over a right angle).",
+        since=2,
     ),
     Parameter(
         "albedo", "C", "1", "color", (0.6, 0.6, 0.6), (0.0, 1.0), (0.0, 1.0),

@@ -31,6 +31,9 @@ def _fabric(name: str, weave: str, mm: float, warp: dict, weft: dict) -> FabricP
 _SPUN = {"irregularity": 0.25, "twist": 0.11, "fiber_count": 130, "inclination": 0.8}
 _FILAMENT = {"irregularity": 0.06, "twist": 0.005, "fiber_count": 80, "inclination": 0.5, "roughness_primary": 0.08}
 
+# Two plies, with the twist at which they close over one repeat, and fibers twisted the other way.
+_PLIED = _SPUN | {"ply_count": 2, "twist": 0.25, "ply_twist": -0.2}
+
 _FLAX: Color = (0.66, 0.58, 0.44)
 _INDIGO: Color = (0.035, 0.055, 0.17)
 _ECRU: Color = (0.78, 0.74, 0.64)
@@ -81,6 +84,19 @@ def _taffeta() -> FabricParameters:
     return _fabric("Taffeta", "plain", 1.5, warp, weft)
 
 
+def _woollen_twill() -> FabricParameters:
+    yarn = dict(per_cm=12, cover=0.95, flattening=1.15, albedo=(0.5, 0.1, 0.09), crimp=0.8, **_PLIED)
+    yarn |= {"irregularity": 0.35, "cuticle_tilt": 0.05, "roughness_longitudinal": 0.35, "migration_rate": 1.0}
+    yarn |= {"flyaway_density": 9000.0, "flyaway_length": 7e-4, "flyaway_loop_fraction": 0.35}
+    return _fabric("WoollenTwill", "twill_2_2", 5, yarn, yarn | {"per_cm": 11, "albedo": (0.56, 0.13, 0.11)})
+
+
+def _duck() -> FabricParameters:
+    yarn = dict(per_cm=14, cover=0.95, flattening=1.1, albedo=(0.72, 0.66, 0.53), crimp=0.8, **_PLIED)
+    yarn |= {"flyaway_density": 2500.0, "flyaway_length": 3.5e-4}
+    return _fabric("Duck", "plain", 5, yarn, yarn | {"per_cm": 12})
+
+
 PRESETS: dict[str, Callable[[], FabricParameters]] = {
     "linen": _linen_plain,
     "denim": _denim,
@@ -90,6 +106,8 @@ PRESETS: dict[str, Callable[[], FabricParameters]] = {
     "canvas": _canvas,
     "herringbone": _herringbone,
     "taffeta": _taffeta,
+    "woollen-twill": _woollen_twill,
+    "duck": _duck,
 }
 
 

@@ -6,15 +6,17 @@ z = 0. Metres.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
-from usdfab.fabric import FabricParameters, System
-from usdfab.fibers.fibers import YarnShape, draw, fiber_offsets, successors
+from usdfab.fabric import FabricParameters, System, YarnParameters
+from usdfab.fibers.draws import Draws, draw, variation
+from usdfab.fibers.fibers import YarnShape, fiber_offsets, successors
+from usdfab.fibers.flyaways import OpenCurves, flyaway_counts, flyaway_offsets
 from usdfab.fibers.segments import Layout, lay_out
 
 PATH_TRACING_VERTICES = 40
@@ -22,6 +24,9 @@ PATH_TRACING_VERTICES = 40
 
 RASTERIZATION_VERTICES = 10
 """Vertices per segment for rasterization (Li et al. 2024, section 7.2)."""
+
+FLYAWAY_VERTICES, MIN_FLYAWAY_VERTICES = 0.5, 8
+"""Vertices on a flyaway, as a share of those on a segment and at least."""
 
 
 @dataclass(frozen=True)
@@ -95,29 +100,47 @@ class FiberSystem:
 
 @dataclass(frozen=True)
 class Patch:
-    """Fibers of one patch, which repeats for ever with period ``size``."""
+    """Fibers of one patch, which repeats for ever with period ``size``.
+
+    ``flyaways`` holds the open curves of the systems that have any. ``z_bounds`` overrides ``z_range``, where several
+    patches are to stand in for each other.
+    """
 
     size: tuple[float, float]
     warp: FiberSystem
     weft: FiberSystem
+    flyaways: tuple[OpenCurves, ...] = ()
+    z_bounds: tuple[float, float] | None = None
 
     @property
     def systems(self) -> tuple[FiberSystem, FiberSystem]:
         """(warp, weft)."""
         return self.warp, self.weft
 
+    @property
+    def curves(self) -> tuple[FiberSystem | OpenCurves, ...]:
+        """The systems and their flyaways."""
+        return (*self.systems, *self.flyaways)
+
     @cached_property
     def z_range(self) -> tuple[float, float]:
-        """Lowest and highest place of any fiber's surface, metres."""
-        low = min(float(s.points[:, 2].min()) - s.radius for s in self.systems)
-        high = max(float(s.points[:, 2].max()) + s.radius for s in self.systems)
+        """Lowest and highest place of any fiber's surface, flyaways included, metres."""
+        if self.z_bounds is not None:
+            return self.z_bounds
+        low = min(float(s.points[:, 2].min()) - s.radius for s in self.curves)
+        high = max(float(s.points[:, 2].max()) + s.radius for s in self.curves)
         return low, high
+
+
+SIDE_BAND = 0.02
+"""Cells next to the tile's border in which all variants are the same, at least (see also ``draws.BORDER_BAND``)."""
 
 
 def generate_patch(
     fabric: FabricParameters,
     vertices_per_segment: int = PATH_TRACING_VERTICES,
     copies: tuple[int, int] = (1, 1),
+    variant: int = 0,
 ) -> Patch:
     """The periodic patch of a fabric.
 
@@ -129,31 +152,141 @@ def generate_patch(
         Vertices on each segment of each fiber.
     copies:
         Repeats along x and y that the patch holds, each with randomness of its own.
+    variant:
+        0, or another number for a patch that can stand in for that of variant 0 anywhere: on and near the border it
+        is the same, inside it differs. Fibers and flyaways that may cross the border are the same in all variants, so
+        a patch of few cells varies little, and one of two by two cells hardly at all.
     """
+    return _patch(_yarn_systems(fabric, vertices_per_segment, copies), variant)
+
+
+def patch_variants(
+    fabric: FabricParameters,
+    vertices_per_segment: int = PATH_TRACING_VERTICES,
+    copies: tuple[int, int] = (1, 1),
+    count: int | None = None,
+) -> list[Patch]:
+    """Variants 0, 1, ... of a fabric's patch (``generate_patch``), all with one ``z_range``.
+
+    ``count`` is the fabric's own number of variants unless given.
+    """
+    systems = _yarn_systems(fabric, vertices_per_segment, copies)
+    patches = [_patch(systems, variant) for variant in range(fabric.variants if count is None else count)]
+    low, high = min(p.z_range[0] for p in patches), max(p.z_range[1] for p in patches)
+    return [replace(p, z_bounds=(low, high)) for p in patches]
+
+
+@dataclass(frozen=True)
+class _YarnSystem:
+    """What all variants of one yarn system have in common. ``size`` (2,) metres is the patch's."""
+
+    name: System
+    yarn: YarnParameters
+    layout: Layout
+    draws: Draws
+    successor: NDArray[np.int64]
+    along_cell: float
+    across_cell: float
+    size: tuple[float, float]
+    seed: int
+    vertices: int
+
+    def fibers(self, variant: int) -> FiberSystem:
+        """The fibers of a variant."""
+        shape, layout, draws = YarnShape.of(self.yarn), self.layout, self.draws
+        changes = None
+        if variant:
+            width = layout.yarns * self.across_cell
+            middle = (np.arange(layout.yarns) + 0.5) * self.across_cell
+            room = np.minimum(middle, width - middle) - self.radius - SIDE_BAND * self.across_cell
+            half_width = self.yarn.radius * self.yarn.flattening
+            margin = self.radius / self.along_cell + SIDE_BAND
+            changes = variation(layout, draws, self.successor, self.seed, variant, room / half_width, margin)
+        across, height = fiber_offsets(shape, layout, draws, self.successor, variation=changes)
+        along = np.broadcast_to(layout.position * self.along_cell, across.shape)
+        points = self._placed(along, across, height, layout.yarn)
+        period = np.array([self.size[0], 0.0, 0.0]) if self.name == "weft" else np.array([0.0, self.size[1], 0.0])
+        colors = np.asarray(self.yarn.colors())
+        return _by_curve(layout, points, self.successor, self.radius, colors, period)
+
+    def flyaways(self, variant: int) -> OpenCurves | None:
+        """The flyaways of a variant, or None where there are none. Those that leave the patch are variant 0's."""
+        length = self.along_cell * self.layout.length
+        counts = flyaway_counts(self.yarn.flyaway_density, length, self.layout.yarns, self.seed, self.name)
+        if counts.sum() == 0:
+            return None
+        owner = np.repeat(np.arange(self.layout.yarns), counts)
+        number = np.concatenate([np.arange(c) for c in counts])
+        common = self._flyaways(owner, number, 0)
+        if variant == 0:
+            return common
+        other = self._flyaways(owner, number, variant)
+        varies = self._is_inside(common) & self._is_inside(other)
+        each = (-1, self.vertices, 3)
+        points = np.where(varies[:, None, None], other.points.reshape(each), common.points.reshape(each))
+        return replace(common, points=points.reshape(-1, 3), loop=np.where(varies, other.loop, common.loop))
+
+    def _flyaways(self, owner: NDArray[np.int64], number: NDArray[np.int64], variant: int) -> OpenCurves:
+        along, across, height, loop = flyaway_offsets(
+            self.yarn, self.layout, self.draws, owner, number, self.along_cell, self.vertices, self.seed, variant
+        )
+        points = self._placed(along, across, height, owner[:, None])
+        offsets = self.vertices * np.arange(len(owner) + 1)
+        colors = np.asarray(self.yarn.colors())
+        albedo = colors[owner % len(colors)]
+        return OpenCurves(self.name, points.reshape(-1, 3), offsets, owner, number, loop, self.radius, albedo)
+
+    def _is_inside(self, curves: OpenCurves) -> NDArray[np.bool_]:
+        """Which curves do not come near the patch's border."""
+        low, high = (b[:, :2] for b in curves.bounds)
+        cell = (self.along_cell, self.across_cell) if self.name == "weft" else (self.across_cell, self.along_cell)
+        margin = SIDE_BAND * np.asarray(cell)
+        return np.all((low > margin) & (high < np.asarray(self.size) - margin), axis=1)
+
+    @property
+    def radius(self) -> float:
+        """Radius of the fibers, metres."""
+        return self.yarn.effective_fiber_radius
+
+    def _placed(
+        self, along: NDArray[np.float64], across: NDArray[np.float64], height: NDArray[np.float64], yarn: NDArray
+    ) -> NDArray[np.float64]:
+        """(..., 3) in the patch's frame from places relative to the yarns' straight axes."""
+        # (x, y, z) is right-handed but (y, x, z) is left-handed; Z twist is to be positive in both systems.
+        across = (across if self.name == "weft" else -across) + (yarn + 0.5) * self.across_cell
+        first, second = (along, across) if self.name == "weft" else (across, along)
+        return np.stack([first, second, height], axis=-1)
+
+
+def _yarn_systems(
+    fabric: FabricParameters, vertices_per_segment: int, copies: tuple[int, int]
+) -> tuple[_YarnSystem, _YarnSystem]:
     if vertices_per_segment < 4:
         raise UsdfabError(f"{vertices_per_segment} vertices per segment are too few, at least 4 are needed")
     picks, ends = fabric.repeat()
     picks, ends = picks * copies[1], ends * copies[0]
     weave = fabric.weave.tiled(picks // fabric.weave.picks, ends // fabric.weave.ends)
     dx, dy = fabric.cell
-    systems = {}
-    for name in ("warp", "weft"):
+
+    def system(name: System) -> _YarnSystem:
         yarn = fabric.system(name)
         layout = lay_out(weave, name, vertices_per_segment)
-        draws = draw(layout, yarn.fiber_count, fabric.seed)
-        shape = YarnShape.of(yarn)
-        successor = successors(shape, layout, draws)
-        across, height = fiber_offsets(shape, layout, draws, successor)
-        along_cell, across_cell = (dx, dy) if name == "weft" else (dy, dx)
-        along = np.broadcast_to(layout.position * along_cell, across.shape)
-        # (x, y, z) is right-handed but (y, x, z) is left-handed; Z twist is to be positive in both systems.
-        across = (across if name == "weft" else -across) + (layout.yarn + 0.5) * across_cell
-        first, second = (along, across) if name == "weft" else (across, along)
-        points = np.stack([first, second, height], axis=-1)
-        colors = np.asarray(yarn.colors())
-        period = np.array([ends * dx, 0.0, 0.0]) if name == "weft" else np.array([0.0, picks * dy, 0.0])
-        systems[name] = _by_curve(layout, points, successor, yarn.effective_fiber_radius, colors, period)
-    return Patch((ends * dx, picks * dy), systems["warp"], systems["weft"])
+        draws = draw(layout, yarn.fiber_count, fabric.seed, yarn.ply_count)
+        successor = successors(YarnShape.of(yarn), layout, draws)
+        cells = (dx, dy) if name == "weft" else (dy, dx)
+        vertices = max(MIN_FLYAWAY_VERTICES, round(FLYAWAY_VERTICES * vertices_per_segment))
+        size = (ends * dx, picks * dy)
+        return _YarnSystem(name, yarn, layout, draws, successor, *cells, size, fabric.seed, vertices)
+
+    return system("warp"), system("weft")
+
+
+def _patch(systems: tuple[_YarnSystem, _YarnSystem], variant: int) -> Patch:
+    if variant < 0:
+        raise ValueError(f"variants are numbered from 0, not {variant}")
+    warp, weft = (s.fibers(variant) for s in systems)
+    flyaways = tuple(f for f in (s.flyaways(variant) for s in systems) if f is not None)
+    return Patch(systems[0].size, warp, weft, flyaways)
 
 
 def _by_curve(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.fabric import FabricParameters, YarnParameters
-from usdfab.fibers import FiberSystem, Patch, generate_patch
+from usdfab.fibers import FiberSystem, OpenCurves, Patch, generate_patch
 from usdfab.scattering.fiber_numba import pack_fiber
 from usdfab.tracer.embree import NEIGHBOR_LEFT, NEIGHBOR_RIGHT, EmbreeScene, curve_scene
 
@@ -58,7 +58,7 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
     materials: list[NDArray] = []
     albedo: list[tuple[float, ...]] = []
     base = 0
-    for system in patch.systems:
+    for system in patch.curves:
         yarn = fabric.system(system.system)
         colors, color_of_curve = np.unique(system.albedo, axis=0, return_inverse=True)
         v, t, f, g, curve = _tile_segments(system, patch.size)
@@ -116,7 +116,11 @@ def spline_vertices(system: FiberSystem) -> tuple[NDArray, NDArray, NDArray[np.i
     -------
     points, tangents: (M, 3); offsets: (curves + 1,). Vertex ``1`` of a curve belongs to its first control point.
     """
-    control, offsets = system.extended(2, 4)
+    return _spline_vertices(*system.extended(2, 4))
+
+
+def _spline_vertices(control: NDArray, offsets: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray[np.int64]]:
+    """Points and unit tangents at all knots of cubic B-splines, and the curves' new offsets."""
     points = (control[:-2] + 4.0 * control[1:-1] + control[2:]) / 6.0
     tangents = control[2:] - control[:-2]
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
@@ -128,39 +132,48 @@ def spline_vertices(system: FiberSystem) -> tuple[NDArray, NDArray, NDArray[np.i
 
 
 def _tile_segments(
-    system: FiberSystem, size: tuple[float, float]
+    system: FiberSystem | OpenCurves, size: tuple[float, float]
 ) -> tuple[NDArray, NDArray, NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]:
     """All segments that overlap the tile [0, size], copies from the neighbouring tiles included.
 
     Returns vertices (V, 3), tangents (V, 3), first vertex (S,), neighbour flags (S,) and curve (S,).
     """
-    points, tangents, offsets = spline_vertices(system)
+    points, tangents, offsets = (
+        _spline_vertices(*system.pinned()) if isinstance(system, OpenCurves) else spline_vertices(system)
+    )
     curve_of_vertex = np.repeat(np.arange(system.curves), np.diff(offsets))
     place = np.arange(len(points)) - offsets[:-1][curve_of_vertex]
     lengths = np.diff(offsets)[curve_of_vertex]
-    # A curve's own segments: from vertex 1 up to the first vertex of its successor, one vertex spare on either side.
-    starts = np.flatnonzero((place >= 1) & (place <= lengths - 4))
+    if isinstance(system, OpenCurves):
+        starts = np.flatnonzero(place <= lengths - 2)
+    else:
+        # A curve's own segments: from vertex 1 up to the first vertex of its successor, one vertex spare each side.
+        starts = np.flatnonzero((place >= 1) & (place <= lengths - 4))
+    joined = place[starts] > 0, place[starts] < lengths[starts] - 2
     low = np.minimum(points[starts], points[starts + 1])[:, :2] - system.radius
     high = np.maximum(points[starts], points[starts + 1])[:, :2] + system.radius
 
-    out_v, out_t, out_f, out_c = [], [], [], []
+    # Fibers reach the tiles beside their own; flyaways may reach farther.
+    nearest = np.floor(-high.max(axis=0, initial=0.0) / size).astype(int) + 1
+    farthest = np.ceil(1.0 - low.min(axis=0, initial=0.0) / size).astype(int) - 1
+    out_v, out_t, out_f, out_g, out_c = [], [], [], [], []
     base = 0
-    for i in (-1, 0, 1):
-        for j in (-1, 0, 1):
+    for i in range(nearest[0], farthest[0] + 1):
+        for j in range(nearest[1], farthest[1] + 1):
             shift = np.array([i * size[0], j * size[1], 0.0])
             inside = np.all((high + shift[:2] > 0.0) & (low + shift[:2] < np.asarray(size)), axis=1)
             chosen = starts[inside]
             if not len(chosen):
                 continue
             used = np.zeros(len(points), dtype=bool)
-            for k in (-1, 0, 1, 2):
-                used[chosen + k] = True
+            before, after = (flag[inside] for flag in joined)
+            for neighbors in (chosen, chosen + 1, chosen[before] - 1, chosen[after] + 2):
+                used[neighbors] = True
             new_index = np.cumsum(used) - 1
             out_v.append(points[used] + shift)
             out_t.append(tangents[used])
             out_f.append(new_index[chosen] + base)
+            out_g.append((NEIGHBOR_LEFT * before + NEIGHBOR_RIGHT * after).astype(np.uint8))
             out_c.append(curve_of_vertex[chosen])
             base += int(used.sum())
-    first = np.concatenate(out_f)
-    flags = np.full(len(first), NEIGHBOR_LEFT | NEIGHBOR_RIGHT, dtype=np.uint8)
-    return np.concatenate(out_v), np.concatenate(out_t), first, flags, np.concatenate(out_c)
+    return tuple(np.concatenate(out) for out in (out_v, out_t, out_f, out_g, out_c))  # type: ignore[return-value]

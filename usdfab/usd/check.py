@@ -18,6 +18,7 @@ from usdfab.usd.read_mesh import UV_NAMES
 from usdfab.usd.registration import FABRIC_API, YARN_API
 from usdfab.usd.schema_source import (
     FABRIC_ATTRIBUTES,
+    SCHEMA_VERSION,
     YARN_ATTRIBUTES,
     SchemaAttribute,
     fabric_attribute_name,
@@ -135,11 +136,14 @@ def _values(prim: Usd.Prim) -> Iterator[Issue]:
     if not is_fabric(prim) or prim.GetTypeName() != "Material":
         return
     found = False
+    version = prim.GetAttribute(fabric_attribute_name("schemaVersion")).Get() or SCHEMA_VERSION
     for name, attribute in _attributes(prim):
         path = prim.GetPath().AppendProperty(name)
         usd_attribute = prim.GetAttribute(name)
         value = usd_attribute.Get() if usd_attribute else None
-        if value is not None and not usd_attribute.HasAuthoredValue():
+        # Files of another version hold other attributes: the defaults of those that came later do no harm.
+        expected = attribute.since <= version <= SCHEMA_VERSION
+        if expected and value is not None and not usd_attribute.HasAuthoredValue():
             message = "not authored; programs that do not know usdfab's schema cannot see it"
             yield _warning(path, prim, "authored", message)
         problem = "the attribute is missing" if value is None else _value_problem(attribute, value)

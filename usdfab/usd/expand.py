@@ -4,7 +4,8 @@ The new file sublayers the user's stage and never flattens it. Beside each cloth
 with a PointInstancer, one copy of the patch for each cell of the uv plane whose centre lies on the mesh. The mesh is
 made invisible. The patch is one BasisCurves for each yarn system and colour: cubic B-splines, nonperiodic, of constant
 width and without normals (round tubes), prolonged so that each fiber ends where its continuation in the next copy
-begins. Prototypes stand under an ``over``, so that they are not drawn themselves.
+begins. Flyaways are BasisCurves of their own (``WarpFlyaways``, ``WeftFlyaways``) that end where they end. Prototypes
+stand under an ``over``, so that they are not drawn themselves.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
-from usdfab.fibers import PATH_TRACING_VERTICES, FiberSystem, Patch, generate_patch
+from usdfab.fibers import PATH_TRACING_VERTICES, FiberSystem, OpenCurves, Patch, generate_patch
 from usdfab.usd.atomic import atomic_path, checked_output
 from usdfab.usd.fabric_io import define_fabric_material
 from usdfab.usd.placement import Placement, Region, estimate, place
@@ -283,16 +284,27 @@ class FiberCurves:
 
 
 def _by_color(patch: Patch) -> Iterator[tuple[str, FiberCurves]]:
-    """``Warp`` and ``Weft``, or ``Warp_0``, ``Warp_1``, ... where their yarns have several colours."""
-    for name, system in (("Warp", patch.warp), ("Weft", patch.weft)):
+    """``Warp`` and ``Weft``, or ``Warp_0``, ``Warp_1``, ... where their yarns have several colours.
+
+    ``WarpFlyaways`` and the like follow; their fibers are numbered on from those of the yarn.
+    """
+    curves: list[tuple[str, FiberSystem | OpenCurves]] = [("Warp", patch.warp), ("Weft", patch.weft)]
+    curves += [(f"{flyaways.system.capitalize()}Flyaways", flyaways) for flyaways in patch.flyaways]
+    fibers = {system.system: int(system.fiber.max()) + 1 for system in patch.systems}
+    for name, system in curves:
         colors, group = np.unique(system.albedo, axis=0, return_inverse=True)
-        points, offsets = spline_points(system)
+        if isinstance(system, OpenCurves):
+            points, offsets = system.pinned()
+            fiber = fibers[system.system] + system.number
+        else:
+            points, offsets = spline_points(system)
+            fiber = system.fiber
         counts = np.diff(offsets)
         for number, color in enumerate(colors):
             mine = group.ravel() == number
             chosen = points[np.repeat(mine, counts)]
             label = name if len(colors) == 1 else f"{name}_{number}"
-            yield label, FiberCurves(chosen, counts[mine], system.yarn[mine], system.fiber[mine], system.radius, color)
+            yield label, FiberCurves(chosen, counts[mine], system.yarn[mine], fiber[mine], system.radius, color)
 
 
 def spline_points(system: FiberSystem) -> tuple[np.ndarray, np.ndarray]:

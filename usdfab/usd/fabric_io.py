@@ -107,6 +107,7 @@ def _fabric_values(fabric: FabricParameters, meters_per_uv: float) -> dict[str, 
         "weave:matrix": fabric.weave.matrix.astype(int).ravel().tolist(),
         "sampleSize": fabric.size,
         "seed": fabric.seed,
+        "variants": fabric.variants,
         "metersPerUv": meters_per_uv,
     }
 
@@ -261,10 +262,11 @@ def fabric_from_prim(prim: Usd.Prim) -> FabricParameters:
     with _at(prim, fabric_attribute_name("weave:matrix")):
         weave = Weave(_weave_matrix(prim, values), values["weave:name"])
     yarns = {system: _yarn_from_prim(prim, system) for system in SYSTEMS}
-    with _at(prim, {"size": fabric_attribute_name("sampleSize"), "seed": fabric_attribute_name("seed")}):
+    places = {"size": "sampleSize", "seed": "seed", "variants": "variants"}
+    with _at(prim, {field: fabric_attribute_name(name) for field, name in places.items()}):
         return FabricParameters(
             weave, values["sampleSize"], yarns["warp"], yarns["weft"], values["seed"], values["name"],
-            Provenance(**provenance),
+            Provenance(**provenance), values["variants"],
         )  # fmt: skip
 
 

@@ -10,12 +10,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from usdfab.fabric.fabric import SIZE_RANGE
+from usdfab.fabric.fabric import SIZE_RANGE, VARIANTS_RANGE
 from usdfab.fabric.parameters import YARN_PARAMETERS, Parameter
 from usdfab.fabric.weave import MAX_REPEAT
 from usdfab.usd.registration import FABRIC_API, YARN_API
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 NAMESPACE = "usdfab"
 YARN_NAMESPACE = f"{NAMESPACE}:yarn"
 _TYPES = {"float": "double", "int": "int", "color": "color3d", "colors": "color3d[]"}
@@ -27,7 +27,8 @@ class SchemaAttribute:
     """One attribute of the schema.
 
     ``name`` is without its namespace (``fiberCount``, ``weave:size``), ``field`` the dataclass field it holds (empty
-    where there is none), ``default`` the value in Python, ``text`` the same as usda text.
+    where there is none), ``default`` the value in Python, ``text`` the same as usda text, ``since`` the schema version
+    that brought it.
     """
 
     name: str
@@ -40,6 +41,7 @@ class SchemaAttribute:
     doc: str
     hard: Limits | None = None
     soft: Limits | None = None
+    since: int = 1
 
 
 def camel(name: str) -> str:
@@ -79,8 +81,9 @@ def _yarn_attribute(p: Parameter) -> SchemaAttribute:
     doc += f"\nRange: {_range_doc(*p.hard)}"
     label = p.name.replace("_", " ").capitalize() + ("" if p.unit == "1" else f" ({p.unit})")
     return SchemaAttribute(
-        camel(p.name), p.name, _TYPES[p.kind], p.default, _usda(p.default, p.kind), label, p.group, doc, p.hard, p.soft
-    )
+        camel(p.name), p.name, _TYPES[p.kind], p.default, _usda(p.default, p.kind), label, p.group, doc, p.hard, p.soft,
+        p.since,
+    )  # fmt: skip
 
 
 YARN_ATTRIBUTES: tuple[SchemaAttribute, ...] = tuple(_yarn_attribute(p) for p in YARN_PARAMETERS)
@@ -128,6 +131,11 @@ FABRIC_ATTRIBUTES: tuple[SchemaAttribute, ...] = (
     SchemaAttribute(
         "seed", "seed", "int", 0, "0", "Seed", "Fabric",
         "Fixes every random draw of the fibers.\nUnits: dimensionless\nRange: [0, 2147483647]", (0, 2**31 - 1),
+    ),
+    SchemaAttribute(
+        "variants", "variants", "int", 4, "4", "Variants", "Fabric",
+        "How many variants of the repeating tile a renderer mixes, so that the eye finds no repetition; 1 is off.\n"
+        f"Units: dimensionless\nRange: {_range_doc(*VARIANTS_RANGE)}", VARIANTS_RANGE, since=2,
     ),
     SchemaAttribute(
         "metersPerUv", "", "double", 0.0, "0", "Metres per uv (m)", "Fabric",

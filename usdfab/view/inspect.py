@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
+from usdfab.fibers.flyaways import OpenCurves
 from usdfab.fibers.patch import FiberSystem, Patch
 from usdfab.imaging import encoded, srgb_to_linear, write_image
 from usdfab.view.gl import check_display, check_off_screen, pyvista, quiet_vtk
@@ -73,10 +74,10 @@ def fiber_scene(patch: Patch, color: FiberColor = "yarn", tiles: tuple[int, int]
     if sides < 3:
         raise UsdfabError(f"a tube with {sides} sides has no inside", place="sides", remedy="use 3 or more")
     step = _decimation(patch, tiles)
-    parts = [_lines(system, step) for system in patch.systems]
+    parts = [_lines(system, step) for system in patch.curves]
     points = np.concatenate([part[0] for part in parts])
     lengths = np.concatenate([np.diff(part[1]) for part in parts])
-    radius = np.concatenate([np.full(len(p), s.radius) for (p, _), s in zip(parts, patch.systems, strict=True)])
+    radius = np.concatenate([np.full(len(p), s.radius) for (p, _), s in zip(parts, patch.curves, strict=True)])
     shifts = [(i * patch.size[0], j * patch.size[1], 0.0) for j in range(tiles[1]) for i in range(tiles[0])]
 
     lines = pv.PolyData()
@@ -85,7 +86,7 @@ def fiber_scene(patch: Patch, color: FiberColor = "yarn", tiles: tuple[int, int]
     if color == "height":
         lines["height"] = lines.points[:, 2] * 1e6
     else:
-        per_curve = np.concatenate([_curve_colors(system, color) for system in patch.systems])
+        per_curve = np.concatenate([_curve_colors(system, color) for system in patch.curves])
         lines["color"] = np.tile(np.repeat(per_curve, lengths, axis=0), (len(shifts), 1))
     lines["radius"] = np.tile(radius, len(shifts))
     tubes = lines.tube(scalars="radius", absolute=True, n_sides=sides, capping=True)
@@ -180,7 +181,7 @@ def show(
 
 def _decimation(patch: Patch, tiles: tuple[int, int]) -> int:
     """Every which vertex is kept."""
-    count = tiles[0] * tiles[1] * sum(len(system.points) for system in patch.systems)
+    count = tiles[0] * tiles[1] * sum(len(curves.points) for curves in patch.curves)
     step = math.ceil(count / MAX_VERTICES)
     if step > MAX_DECIMATION:
         raise UsdfabError(
@@ -193,9 +194,9 @@ def _decimation(patch: Patch, tiles: tuple[int, int]) -> int:
     return step
 
 
-def _lines(system: FiberSystem, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points and offsets of the curves, each led on to where the next patch begins, thinned out by ``step``."""
-    points, offsets = system.extended(0, 1)
+def _lines(system: FiberSystem | OpenCurves, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Points and offsets of the curves, thinned out by ``step``; fibers are led on to where the next patch begins."""
+    points, offsets = (system.points, system.offsets) if isinstance(system, OpenCurves) else system.extended(0, 1)
     if step == 1:
         return points, offsets
     curve = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
@@ -211,7 +212,7 @@ def _connectivity(lengths: NDArray[np.int64]) -> NDArray[np.int64]:
     return cells
 
 
-def _curve_colors(system: FiberSystem, color: FiberColor) -> NDArray[np.uint8]:
+def _curve_colors(system: FiberSystem | OpenCurves, color: FiberColor) -> NDArray[np.uint8]:
     """(curves, 3) sRGB codes."""
     if color == "albedo":
         return encoded(system.albedo)
