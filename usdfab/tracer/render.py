@@ -1,12 +1,12 @@
-"""Rendering a scene: prepare tiles, meshes and lights, then passes of the kernel until samples or time are up."""
+"""Rendering a scene: prepare tiles, meshes and lights, then passes of the kernel until it is good enough."""
 
 from __future__ import annotations
 
+import math
 import os
-import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +14,33 @@ from numpy.typing import NDArray
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
 from usdfab.tracer import embree
+from usdfab.tracer.accumulate import Progress, Sums, ThreadRunner, accumulate
+from usdfab.tracer.film import (
+    ALBEDO,
+    ALPHA,
+    CHANNELS,
+    DEPTH,
+    DIRECT,
+    FIBER_ID,
+    NORMAL,
+    RAYS,
+    RGB,
+    SAMPLES,
+    UV,
+    YARN_ID,
+)
 from usdfab.tracer.intrinsics import filter_address
-from usdfab.tracer.film import CHANNELS
 from usdfab.tracer.kernel import Patches, View, World, render_tile
 from usdfab.tracer.lights import pack_lights
 from usdfab.tracer.macro_scene import build_macro
+from usdfab.tracer.memory import check_memory
 from usdfab.tracer.patch_scene import PatchScene, build_patch_scene
+from usdfab.tracer.schedule import Window, Work, bounds, plan_tiles, relative_error
 from usdfab.usd.scene import Camera, Scene
 
 MAX_PIXELS = 2**28
-ROWS_PER_TASK = 4
-Progress = Callable[[int, int], None]
-"""Called with (work done, work to do), in rows times samples per pixel."""
+"""Most pixels in memory at once."""
+MAX_SIDE = 2**20
 
 
 @dataclass(frozen=True)
@@ -35,6 +50,10 @@ class RenderSettings:
     ``resolution`` is (width, height); where one is 0 it follows from the camera's aspect. ``max_depth`` counts path
     vertices as Mitsuba does (1: lights only, 2: direct light). ``time_limit`` in seconds ends the render after the
     pass that exceeds it. ``seed`` fixes every random number, whatever ``threads`` is.
+
+    ``noise`` ends tiles whose estimated relative error (``schedule.relative_error``) is at most this; ``spp`` is then
+    the most that a pixel gets. ``region`` (x0, y0, x1, y1) in pixels of the whole picture, upper ends excluded, renders
+    only that window. ``part`` (i, n), i from 1, renders only the i-th of n parts of it.
     """
 
     resolution: tuple[int, int] = (720, 0)
@@ -43,14 +62,33 @@ class RenderSettings:
     seed: int = 0
     threads: int | None = None
     time_limit: float | None = None
+    noise: float | None = None
+    region: Window | None = None
+    part: tuple[int, int] = (1, 1)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """All that the sums of a pixel depend on besides the scene: small, and sent to whoever renders tiles."""
+
+    camera: Camera
+    width: int
+    height: int
+    seed: int
+    max_depth: int
 
 
 @dataclass(frozen=True)
 class Render:
-    """A picture, linear Rec. 709, rows from the top.
+    """A picture or a region of one, linear Rec. 709, rows from the top.
 
     ``pixels`` (H, W, 3) with the camera's exposure applied; ``variance`` (H, W, 3) of the pixel means; ``albedo`` and
-    ``normal`` (H, W, 3) of what is seen first, ``depth`` (H, W) metres, ``alpha`` (H, W).
+    ``normal`` (H, W, 3) of what is seen first, ``depth`` (H, W) metres, ``alpha`` (H, W). ``direct`` (H, W, 3): the
+    part of ``pixels`` that was scattered at most once; ``uv`` (H, W, 2) of what is seen first; ``fiber_id`` and
+    ``yarn_id`` (H, W) int32, 0 where no fiber is; ``samples`` (H, W) taken.
+
+    ``spp`` is the mean of ``samples``, rounded; ``noise`` the relative error reached (``schedule.relative_error``),
+    infinite where single samples tell nothing. ``region`` is what part of ``size`` (width, height) is shown.
     """
 
     pixels: NDArray[np.float32]
@@ -59,9 +97,17 @@ class Render:
     normal: NDArray[np.float32]
     depth: NDArray[np.float32]
     alpha: NDArray[np.float32]
+    direct: NDArray[np.float32]
+    uv: NDArray[np.float32]
+    fiber_id: NDArray[np.int32]
+    yarn_id: NDArray[np.int32]
+    samples: NDArray[np.int32]
     spp: int
     seconds: float
     rays: float
+    noise: float
+    region: Window
+    size: tuple[int, int]
     patch_segments: int
 
 
@@ -89,47 +135,61 @@ class Tracer:
         """Fiber segments in memory, whatever the cloth's area."""
         return sum(len(s.segment_vertex) for s in self._scenes)
 
+    def sample(self, shot: Shot, window: Window, first: int, samples: int, sums: Sums) -> Sums:
+        """The sums (h, w, LAYERS) of a window with samples ``first`` to ``first + samples`` added; ``sums`` is kept.
+
+        A pure function: the same on any machine of the same kind, and the same however samples are divided among calls.
+        """
+        film, squares = sums[..., :CHANNELS].copy(), sums[..., CHANNELS:].copy()
+        view = _view(shot.camera, shot.width, shot.height)
+        render_tile(self.world, view, np.uint64(shot.seed), window, first, samples, shot.max_depth, film, squares)
+        return np.concatenate([film, squares], axis=-1)
+
     def render(self, camera: Camera, settings: RenderSettings, progress: Progress | None = None) -> Render:
-        """Render what a camera sees. An interrupt (Ctrl-C) takes effect within a few rows."""
-        width, height = resolve_resolution(camera, settings.resolution)
-        if settings.spp < 1 or settings.max_depth < 1:
-            raise UsdfabError(f"spp {settings.spp} and depth {settings.max_depth} must be at least 1")
-        film = np.zeros((height, width, CHANNELS))
-        squares = np.zeros((height, width, 3))
-        view = View(
-            np.ascontiguousarray(camera.to_world[:3, :4], dtype=float),
-            np.r_[camera.tan_half, camera.offset].astype(float),
-            width,
-            height,
-        )
-        threads = settings.threads or os.cpu_count() or 1
-        chunks = [(row, min(row + ROWS_PER_TASK, height)) for row in range(0, height, ROWS_PER_TASK)]
-        start = time.perf_counter()
-        done = 0
-        with ThreadPoolExecutor(threads) as pool:
-            while done < settings.spp:
-                # Passes grow, so that the first picture is there soon and the overhead of passes vanishes.
-                samples = min(max(1, done), 16, settings.spp - done)
+        """Render what a camera sees. An interrupt (Ctrl-C) takes effect within a few tiles."""
+        shot, work = start(camera, settings)
+        with ThreadRunner(partial(self.sample, shot), thread_count(settings.threads)) as runner:
+            seconds = accumulate(
+                work, runner, settings.spp, noise=settings.noise, gain=2.0**camera.exposure,
+                time_limit=settings.time_limit, progress=progress,
+            )  # fmt: skip
+        return develop(work.sums, work.window, shot, settings, seconds, self.segments)
 
-                def work(rows: tuple[int, int], first: int = done, samples: int = samples) -> None:
-                    seed = np.uint64(settings.seed)
-                    part = slice(*rows)
-                    render_tile(
-                        self.world, view, seed, (0, rows[0], width, rows[1]), first, samples, settings.max_depth,
-                        film[part], squares[part],
-                    )  # fmt: skip
 
-                try:
-                    for rows, _ in zip(chunks, pool.map(work, chunks), strict=True):
-                        if progress:
-                            progress(done * height + samples * rows[1], settings.spp * height)
-                except BaseException:  # an interrupt must not wait for the rows that have not begun
-                    pool.shutdown(wait=True, cancel_futures=True)
-                    raise
-                done += samples
-                if settings.time_limit is not None and time.perf_counter() - start > settings.time_limit:
-                    break
-        return _develop(film, squares, done, camera.exposure, time.perf_counter() - start, self.segments)
+def thread_count(threads: int | None) -> int:
+    """Threads to use: those asked for, or all cores that this process may use."""
+    if threads is not None:
+        if threads < 1:
+            raise UsdfabError(f"{threads} threads can do nothing", place="--threads", remedy="give 1 or more")
+        return threads
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def start(camera: Camera, settings: RenderSettings) -> tuple[Shot, Work]:
+    """The empty sums of a render, after checking all that can be checked beforehand.
+
+    Raises
+    ------
+    UsdfabError
+        For settings that make no sense and pictures that do not fit into memory.
+    """
+    width, height = resolve_resolution(camera, settings.resolution)
+    if settings.spp < 1 or settings.max_depth < 1:
+        raise UsdfabError(f"spp {settings.spp} and depth {settings.max_depth} must be at least 1")
+    if settings.noise is not None and not 0.0 < settings.noise < math.inf:
+        raise UsdfabError(f"{settings.noise} is no relative error", place="--noise", remedy="give e.g. 0.05")
+    if settings.time_limit is not None and not settings.time_limit >= 0.0:
+        raise UsdfabError(f"{settings.time_limit} is no duration", place="--time", remedy="give seconds")
+    i, n = settings.part
+    if not 1 <= i <= n:
+        raise UsdfabError(f"there is no tile {i} of {n}", place="--tile", remedy="write e.g. 1/4 to 4/4")
+    region = resolve_region(settings.region, width, height)
+    tiles = plan_tiles(width, height, region, settings.part, settings.noise is not None)
+    x0, y0, x1, y1 = bounds(tiles)
+    if (x1 - x0) * (y1 - y0) > MAX_PIXELS:
+        raise UsdfabError(f"{x1 - x0} x {y1 - y0} pixels are too many", remedy=f"stay below {MAX_PIXELS} pixels")
+    check_memory(x1 - x0, y1 - y0)
+    return Shot(camera, width, height, settings.seed, settings.max_depth), Work(tiles)
 
 
 def resolve_resolution(camera: Camera, resolution: tuple[int, int]) -> tuple[int, int]:
@@ -142,9 +202,29 @@ def resolve_resolution(camera: Camera, resolution: tuple[int, int]) -> tuple[int
         height = max(1, round(width / aspect))
     elif width <= 0:
         width = max(1, round(height * aspect))
-    if width * height > MAX_PIXELS:
-        raise UsdfabError(f"{width} x {height} pixels are too many", remedy=f"stay below {MAX_PIXELS} pixels")
+    if max(width, height) > MAX_SIDE:
+        raise UsdfabError(f"{width} x {height} pixels are too many", remedy=f"stay below {MAX_SIDE} on a side")
     return width, height
+
+
+def resolve_region(region: Window | None, width: int, height: int) -> Window:
+    """The window of a picture to render; all of it by default."""
+    x0, y0, x1, y1 = region or (0, 0, width, height)
+    if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
+        raise UsdfabError(
+            f"{x0},{y0},{x1},{y1} is no part of {width} x {height} pixels", place="--region", remedy="x0,y0,x1,y1"
+        )
+    return x0, y0, x1, y1
+
+
+def _view(camera: Camera, width: int, height: int) -> View:
+    """A camera as the kernel reads it."""
+    return View(
+        np.ascontiguousarray(camera.to_world[:3, :4], dtype=float),
+        np.r_[camera.tan_half, camera.offset].astype(float),
+        width,
+        height,
+    )
 
 
 def _pack_patches(scenes: list[PatchScene]) -> Patches:
@@ -172,23 +252,36 @@ def _pack_patches(scenes: list[PatchScene]) -> Patches:
     )
 
 
-def _develop(film: NDArray, squares: NDArray, spp: int, exposure: float, seconds: float, segments: int) -> Render:
-    gain = 2.0**exposure
-    mean = film[..., :3] / spp
-    variance = np.maximum(squares / spp - mean * mean, 0.0) / max(spp - 1, 1)
-    alpha = film[..., 10] / spp
-    seen = np.maximum(film[..., 10], 1.0)
-    normal = film[..., 6:9]
+def develop(sums: Sums, window: Window, shot: Shot, settings: RenderSettings, seconds: float, segments: int) -> Render:
+    """The picture of a region from the sums (H, W, LAYERS) of a window around it."""
+    region = resolve_region(settings.region, shot.width, shot.height)
+    x0, y0, x1, y1 = region
+    sums = sums[y0 - window[1] : y1 - window[1], x0 - window[0] : x1 - window[0]]
+    gain = 2.0**shot.camera.exposure
+    samples = sums[..., SAMPLES]
+    n = np.maximum(samples, 1.0)[..., None]
+    mean = sums[..., RGB : RGB + 3] / n
+    variance = np.maximum(sums[..., CHANNELS:] / n - mean * mean, 0.0) / np.maximum(n - 1, 1)
+    seen = np.maximum(sums[..., ALPHA], 1.0)
+    normal = sums[..., NORMAL : NORMAL + 3]
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     return Render(
         pixels=(gain * mean).astype(np.float32),
         variance=(gain * gain * variance).astype(np.float32),
-        albedo=(film[..., 3:6] / spp).astype(np.float32),
+        albedo=(sums[..., ALBEDO : ALBEDO + 3] / n).astype(np.float32),
         normal=(normal / np.maximum(length, 1e-12)).astype(np.float32),
-        depth=(film[..., 9] / seen).astype(np.float32),
-        alpha=alpha.astype(np.float32),
-        spp=spp,
+        depth=(sums[..., DEPTH] / seen).astype(np.float32),
+        alpha=(sums[..., ALPHA] / n[..., 0]).astype(np.float32),
+        direct=(gain * sums[..., DIRECT : DIRECT + 3] / n).astype(np.float32),
+        uv=(sums[..., UV : UV + 2] / seen[..., None]).astype(np.float32),
+        fiber_id=sums[..., FIBER_ID].astype(np.int32),
+        yarn_id=sums[..., YARN_ID].astype(np.int32),
+        samples=samples.astype(np.int32),
+        spp=round(float(samples.mean())),
         seconds=seconds,
-        rays=float(film[..., 11].sum()),
+        rays=float(sums[..., RAYS].sum()),
+        noise=relative_error(sums, gain),
+        region=region,
+        size=(shot.width, shot.height),
         patch_segments=segments,
     )
