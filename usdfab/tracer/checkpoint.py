@@ -12,7 +12,7 @@ import math
 import struct
 import time
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -233,9 +233,19 @@ def _common(a: Window, b: Window) -> Window | None:
 class Autosave:
     """Saves every now and then (``accumulate.Save``). A disk that refuses does not end the render: it is said once."""
 
-    def __init__(self, path: Path, identity: Identity, spp: int, warn: Any, every: float = SAVE_SECONDS) -> None:
+    def __init__(
+        self,
+        path: Path,
+        identity: Identity,
+        spp: int,
+        warn: Callable[[str], None],
+        before: float = 0.0,
+        every: float = SAVE_SECONDS,
+    ) -> None:
+        """``before`` are the seconds that went into the sums in earlier runs, ``every`` those between two saves."""
         self._path, self._identity, self._spp, self._warn, self._every = path, identity, spp, warn, every
-        self._last, self._cost = time.perf_counter(), 0.0
+        self._start = self._last = time.perf_counter()
+        self._before, self._cost = before, 0.0
         self._complained = False
         self.saved = False
         """Whether the file holds what was last given."""
@@ -245,8 +255,10 @@ class Autosave:
         self.saved = False
         if not must and begun - self._last < max(self._every, self._cost / SAVE_SHARE):
             return
+        if not work.counts().any():
+            return
         try:
-            save_work(self._path, self._identity, work, self._spp)
+            save_work(self._path, self._identity, work, self._spp, self._before + begun - self._start)
             self.saved = True
         except UsdfabError as error:
             if not self._complained or must:

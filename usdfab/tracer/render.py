@@ -153,7 +153,8 @@ class Tracer:
                 work, runner, settings.spp, noise=settings.noise, gain=2.0**camera.exposure,
                 time_limit=settings.time_limit, progress=progress,
             )  # fmt: skip
-        return develop(work.sums, work.window, shot, settings, seconds, self.segments)
+        region, size = resolve_region(settings.region, shot.width, shot.height), (shot.width, shot.height)
+        return develop(work, region, size, camera.exposure, seconds, self.segments)
 
 
 def thread_count(threads: int | None) -> int:
@@ -252,12 +253,12 @@ def _pack_patches(scenes: list[PatchScene]) -> Patches:
     )
 
 
-def develop(sums: Sums, window: Window, shot: Shot, settings: RenderSettings, seconds: float, segments: int) -> Render:
-    """The picture of a region from the sums (H, W, LAYERS) of a window around it."""
-    region = resolve_region(settings.region, shot.width, shot.height)
-    x0, y0, x1, y1 = region
-    sums = sums[y0 - window[1] : y1 - window[1], x0 - window[0] : x1 - window[0]]
-    gain = 2.0**shot.camera.exposure
+def develop(
+    work: Work, region: Window, size: tuple[int, int], exposure: float, seconds: float, segments: int
+) -> Render:
+    """The picture of ``region``, which the work's window covers, of a whole picture of ``size`` (width, height)."""
+    sums = work.part(region)
+    gain = 2.0**exposure
     samples = sums[..., SAMPLES]
     n = np.maximum(samples, 1.0)[..., None]
     mean = sums[..., RGB : RGB + 3] / n
@@ -282,6 +283,6 @@ def develop(sums: Sums, window: Window, shot: Shot, settings: RenderSettings, se
         rays=float(sums[..., RAYS].sum()),
         noise=relative_error(sums, gain),
         region=region,
-        size=(shot.width, shot.height),
+        size=size,
         patch_segments=segments,
     )
