@@ -9,11 +9,12 @@ scene once and keeps it. What it read must have the same fingerprint as here, so
 from __future__ import annotations
 
 import logging
+import signal
+import threading
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Executor, Future
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 from usdfab.cli.scene_source import SceneSource, read_textures
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 RETRIES = 3
 """Times that a tile is given to another worker after its worker died."""
 
-_lock = Lock()
+_lock = threading.Lock()
 _kept: tuple[str, Tracer] | None = None
 
 
@@ -159,17 +160,31 @@ def dask_executor(scheduler: str, workers: int | None, threads: int) -> Iterator
         yield client.get_executor(pure=False), max(1, sum(client.nthreads().values()))
 
 
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """What starts in this block inherits it: Ctrl-C at a terminal goes to all its processes, and one is to answer."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _client(distributed: Any, stack: ExitStack, scheduler: str, workers: int | None, threads: int) -> Any:
     if scheduler != "local":
         client = stack.enter_context(distributed.Client(scheduler, set_as_default=False, timeout="10s"))
         client.wait_for_workers(1, timeout="60s")
         return client
     count = workers or max(2, threads // 8)
-    cluster = distributed.LocalCluster(
-        n_workers=count,
-        threads_per_worker=max(1, threads // count),
-        processes=True,
-        dashboard_address=None,
-        silence_logs=logging.CRITICAL,
-    )
+    with _interrupts_ignored():
+        cluster = distributed.LocalCluster(
+            n_workers=count,
+            threads_per_worker=max(1, threads // count),
+            processes=True,
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+        )
     return stack.enter_context(distributed.Client(stack.enter_context(cluster), set_as_default=False))

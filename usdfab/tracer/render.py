@@ -185,10 +185,11 @@ def start(camera: Camera, settings: RenderSettings) -> tuple[Shot, Work]:
     if not 1 <= i <= n:
         raise UsdfabError(f"there is no tile {i} of {n}", place="--tile", remedy="write e.g. 1/4 to 4/4")
     region = resolve_region(settings.region, width, height)
+    columns, rows = region[2] - region[0], region[3] - region[1]
+    if columns * rows / n > MAX_PIXELS:
+        raise UsdfabError(f"{columns} x {rows} pixels are too many", remedy=f"stay below {MAX_PIXELS} pixels")
     tiles = plan_tiles(width, height, region, settings.part, settings.noise is not None)
     x0, y0, x1, y1 = bounds(tiles)
-    if (x1 - x0) * (y1 - y0) > MAX_PIXELS:
-        raise UsdfabError(f"{x1 - x0} x {y1 - y0} pixels are too many", remedy=f"stay below {MAX_PIXELS} pixels")
     check_memory(x1 - x0, y1 - y0)
     return Shot(camera, width, height, settings.seed, settings.max_depth), Work(tiles)
 
