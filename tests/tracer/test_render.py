@@ -266,29 +266,27 @@ def test_an_error_in_a_worker_is_passed_on_and_what_is_done_is_kept(sample):
 # --- stopping --------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=512)
-def exponential_draws(seed: int, sample: int) -> np.ndarray:
-    return np.random.default_rng([seed, sample]).exponential(1.0, (64, 64))
+@lru_cache(maxsize=1)
+def exponential_draws(seed: int, rare: bool) -> np.ndarray:
+    """(512, 64, 64) samples of mean 1, or that are 40 in one of 1000."""
+    rng = np.random.default_rng([seed, rare])
+    draws = rng.exponential(0.5 if rare else 1.0, (512, 64, 64)).astype(np.float32)
+    return (
+        np.where(rng.random(draws.shape, dtype=np.float32) < 1e-3, draws + np.float32(40.0), draws) if rare else draws
+    )
 
 
-@lru_cache(maxsize=512)
-def rare_events(seed: int, sample: int) -> np.ndarray:
-    return np.where(np.random.default_rng([seed, sample, 1]).random((64, 64)) < 1e-3, 40.0, 0.0)
-
-
-def noisy(rng_seed: int, bright: Callable) -> Callable:
+def noisy(seed: int, bright: Callable = lambda x, y: 1.0, rare: bool = False) -> Callable:
     """A stand-in for the tracer: gray samples from an exponential law of mean ``bright(x, y)``."""
 
     def sample(window, first, samples, sums):
         x0, y0, x1, y1 = window
+        y, x = np.mgrid[y0:y1, x0:x1]
+        values = exponential_draws(seed, rare)[first : first + samples, y0:y1, x0:x1] * bright(x, y)
         out = sums.copy()
-        for k in range(first, first + samples):
-            draws = exponential_draws(rng_seed, k)[y0:y1, x0:x1]
-            y, x = np.mgrid[y0:y1, x0:x1]
-            value = draws * bright(x, y)
-            out[..., RGB : RGB + 3] += value[..., None]
-            out[..., CHANNELS:] += (value**2)[..., None]
-            out[..., SAMPLES] += 1
+        out[..., RGB : RGB + 3] += values.sum(axis=0, dtype=float)[..., None]
+        out[..., CHANNELS:] += (values.astype(float) ** 2).sum(axis=0)[..., None]
+        out[..., SAMPLES] += samples
         return out
 
     return sample
@@ -313,25 +311,10 @@ def test_the_error_is_that_of_the_picture():
 def test_adaptive_sampling_reaches_its_noise_without_bias():
     """Means of pictures against the known truth, over many seeds; a rare bright event tempts tiles to stop early."""
     wanted, side, seeds = 0.35, 64, 60
-
-    def rare(seed):
-        inner = noisy(seed, lambda x, y: 0.5)
-
-        def sample(window, first, samples, sums):
-            out = inner(window, first, samples, sums)
-            x0, y0, x1, y1 = window
-            for k in range(first, first + samples):
-                value = rare_events(seed, k)[y0:y1, x0:x1]
-                out[..., CHANNELS:] += (value**2)[..., None]
-                out[..., RGB : RGB + 3] += value[..., None]
-            return out
-
-        return sample
-
     means, spp, reached = [], [], []
     for seed in range(seeds):
         work = Work(plan_tiles(side, side, (0, 0, side, side), adaptive=True))
-        with ThreadRunner(rare(seed), 1) as runner:
+        with ThreadRunner(noisy(seed, rare=True), 1) as runner:
             accumulate(work, runner, 512, noise=wanted)
         n = work.sums[..., SAMPLES]
         means.append((work.sums[..., 0] / n).mean())
