@@ -222,3 +222,22 @@ def test_a_full_disk_is_one_line_and_no_half_written_part(run, tiny, tmp_path, m
     code, _, err = run("render", tiny, "-o", tmp_path / "a.exr", *SMALL, "--tile", "1/2")
     assert code == 2 and "No space left on device" in err.splitlines()[-1]
     assert not list(tmp_path.iterdir())
+
+
+def test_a_picture_that_cannot_be_written_is_not_lost(run, tiny, whole, tmp_path, monkeypatch) -> None:
+    from usdfab.cli import render_frame
+    from usdfab.errors import UsdfabError
+
+    def full(*_):
+        raise UsdfabError("cannot be written (No space left on device)", place="a.exr")
+
+    write = render_frame.write_picture
+    monkeypatch.setattr(render_frame, "write_picture", full)
+    command = ("render", tiny, "-o", tmp_path / "a.exr", *SMALL, "--aov")
+    code, _, err = run(*command)
+    assert code == 2 and err.splitlines()[-1] == "usdfab: a.exr: cannot be written (No space left on device)"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr.partial"]
+    monkeypatch.setattr(render_frame, "write_picture", write)
+    assert run(*command, "--resume")[0] == 0
+    for name, values in read_layers(tmp_path / "a.exr").items():
+        np.testing.assert_array_equal(values, read_layers(whole)[name], err_msg=name)

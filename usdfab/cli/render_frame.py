@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import Executor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -110,15 +110,14 @@ def _render(
             if autosave.saved and not options.quiet:
                 say(f"the unfinished render is kept in {file.partial}; --resume goes on with it")
             raise
-    if settings.part != (1, 1) or file.output != file.picture:
-        work.keep_wanted()
-        save_work(file.output, identity, work, settings.spp, seconds)
-        facts, line = _part_facts(file, work, settings, seconds)
-    else:
-        size = (shot.width, shot.height)
-        render = develop(work, identity.region, size, shot.camera.exposure, seconds, segments)
-        write_picture(file.output, render, options.picture)
-        facts, line = render_facts(file.output, render), render_line(file.output, render)
+    try:
+        facts, line = _write(file, shot, work, settings, identity, seconds, options.picture)
+    except UsdfabError:
+        # A full disk, a folder that went away: hours of work are not to be lost with it.
+        with suppress(UsdfabError):
+            save_work(file.partial, identity, work, settings.spp, seconds)
+            say(f"the render is kept in {file.partial}; --resume writes the picture")
+        raise
     autosave.remove()
     if not (options.quiet or options.json):
         say(line)
@@ -138,6 +137,27 @@ def _runner(
     tracer = Tracer(scene, textures)
     with ThreadRunner(partial(tracer.sample, shot), settings.threads or 1) as here:
         yield here, tracer.segments
+
+
+def _write(
+    file: RenderFile,
+    shot: Shot,
+    work: Work,
+    settings: RenderSettings,
+    identity: Identity,
+    seconds: float,
+    picture: PictureOptions,
+) -> tuple[Facts, str]:
+    """Write the picture or the part; returns what is to be said of it as JSON and as a line."""
+    if file.output == file.picture:
+        size = (shot.width, shot.height)
+        render = develop(work, identity.region, size, shot.camera.exposure, seconds, identity.segments)
+        write_picture(file.output, render, picture)
+        return render_facts(file.output, render), render_line(file.output, render)
+    part = Work(work.tiles, work.sums.copy(), work.stops)
+    part.keep_wanted()
+    save_work(file.output, identity, part, settings.spp, seconds)
+    return _part_facts(file, part, settings, seconds)
 
 
 def _part_facts(file: RenderFile, work: Work, settings: RenderSettings, seconds: float) -> tuple[Facts, str]:
