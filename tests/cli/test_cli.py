@@ -56,7 +56,7 @@ def refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
 def test_help_lists_every_command_and_shows_examples() -> None:
     done = usdfab("--help")
     assert done.returncode == 0
-    for name in ("fit", "render", "inspect", "expand", "new", "edit", "info", "check", "evaluate", "schema"):
+    for name in ("fit", "render", "merge", "inspect", "expand", "new", "edit", "info", "check", "evaluate", "schema"):
         assert name in done.stdout
         page = usdfab(name, "--help")
         assert page.returncode == 0
@@ -67,7 +67,7 @@ def test_help_and_light_commands_load_nothing_heavy(small: Path) -> None:
     script = (
         "import sys\nfrom usdfab.cli.main import _run\n"
         "assert _run(sys.argv[1:]) == 0\n"
-        "heavy = {'torch', 'mitsuba', 'drjit', 'pyvista', 'numba', 'OpenImageIO'} & set(sys.modules)\n"
+        "heavy = {'torch', 'mitsuba', 'drjit', 'pyvista', 'numba', 'OpenImageIO', 'distributed'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
     for arguments in (["--help"], ["info", str(small)], ["render", "--help"]):
@@ -160,7 +160,7 @@ def test_render_of_the_drape_wearing_a_fabric(small: Path, tmp_path: Path) -> No
     from usdfab.imaging import read_layers
 
     layers = read_layers(out)
-    assert {"", "albedo", "normal", "Z", "alpha", "variance"} <= set(layers)
+    assert {"", "albedo", "normal", "Z", "A", "variance", "samples", "uv"} <= set(layers)
     assert all(np.isfinite(layer).all() for layer in layers.values())
     assert layers[""].mean() > 0.02
 
@@ -269,7 +269,7 @@ def test_unwritable_output_is_found_before_the_work(tmp_path: Path, small: Path)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
-def test_interrupt_ends_with_130_and_no_file(small: Path, tmp_path: Path) -> None:
+def test_interrupt_ends_with_130_and_no_picture(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "x.png"
     arguments = ["render", str(small), "-o", str(out), "--resolution", "400", "--spp", "100000"]
     process = subprocess.Popen([sys.executable, "-m", "usdfab.cli.main", *arguments], stderr=subprocess.PIPE, text=True)
@@ -277,8 +277,8 @@ def test_interrupt_ends_with_130_and_no_file(small: Path, tmp_path: Path) -> Non
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 130, errors
-    assert "interrupted" in errors
-    assert list(tmp_path.iterdir()) == []
+    assert "interrupted" in errors and "--resume" in errors
+    assert list(tmp_path.iterdir()) == [tmp_path / "x.png.partial"]
 
 
 # --- the main job ----------------------------------------------------------------------------------------------------

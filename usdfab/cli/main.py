@@ -30,6 +30,7 @@ Usage examples:
 COMMANDS = {
     "fit": "Estimate a fabric from one photo of woven cloth.",
     "render": "Render a fabric as a swatch, or a stage whose meshes wear fabrics.",
+    "merge": "Join the parts of a picture that render --tile wrote.",
     "inspect": "Look at the fibers of a fabric, in a window or as a picture.",
     "expand": "Write the cloth of a stage as instanced fibers for any USD program.",
     "new": "Write a new fabric from a preset or a weave.",

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,6 +24,19 @@ Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative="", help="No 
 Resolution = Annotated[str, Parameter(help="WIDTHxHEIGHT in pixels, or WIDTH alone.")]
 Denoise = Annotated[
     bool, Parameter(negative="", help="Remove the noise of few samples (biased; needs the denoise extra).")
+]
+Aov = Annotated[
+    list[str] | None,
+    Parameter(
+        consume_multiple=True,
+        negative="",
+        help="EXR only: further layers; bare for all, or of depth, normal, albedo, fiber_id, yarn_id, uv, direct, "
+        "indirect, samples, variance, alpha.",
+    ),
+]
+Exposure = Annotated[float | None, Parameter(help="Not for EXR: stops to brighten the picture by.")]
+View = Annotated[
+    str | None, Parameter(help="Not for EXR: standard (clipped, the default) or reinhard (highlights roll off).")
 ]
 Threads = Annotated[int | None, Parameter(help="Threads to use; all by default.")]
 
@@ -49,6 +64,76 @@ def parse_resolution(text: str) -> tuple[int, int]:
     if not 1 <= len(numbers) <= 2 or any(n < 1 for n in numbers):
         raise UsdfabError(f"'{text}' is no resolution", place="--resolution", remedy="write e.g. 1280x720 or 720")
     return numbers[0], numbers[1] if len(numbers) == 2 else 0
+
+
+@dataclass(frozen=True)
+class Region:
+    """A window of a picture: four numbers, each in pixels or, where ``percent``, in hundredths of width or height."""
+
+    corners: tuple[float, float, float, float]
+    percent: tuple[bool, bool, bool, bool]
+
+    def pixels(self, width: int, height: int) -> tuple[int, int, int, int]:
+        """(x0, y0, x1, y1) in a picture of this size, rounded to whole pixels."""
+        sizes = (width, height, width, height)
+        x0, y0, x1, y1 = (
+            round(c * size / 100 if percent else c)
+            for c, percent, size in zip(self.corners, self.percent, sizes, strict=True)
+        )
+        return x0, y0, x1, y1
+
+
+def parse_region(text: str | None) -> Region | None:
+    """``10,20,200,100`` in pixels from the top left, upper ends excluded, or ``25%,25%,75%,75%``."""
+    if text is None:
+        return None
+    parts = [re.fullmatch(r"(\d+(?:\.\d+)?)(%?)", part.strip()) for part in text.split(",")]
+    found = [(float(part[1]), bool(part[2])) for part in parts if part]
+    whole = all(percent or number.is_integer() for number, percent in found)
+    if len(parts) != 4 or len(found) != 4 or not whole:
+        raise UsdfabError(
+            f"'{text}' is no region", place="--region", remedy="write x0,y0,x1,y1 in pixels or e.g. 25%,25%,75%,75%"
+        )
+    (a, b, c, d), (p, q, r, s) = zip(*found, strict=True)
+    return Region((a, b, c, d), (p, q, r, s))
+
+
+MAX_FRAMES = 1_000_000
+
+
+def parse_frames(text: str) -> list[int]:
+    """Whole time codes from ``1-10``, ``1-10x2`` (every second), ``7`` or several of these with commas between."""
+    frames: dict[int, None] = {}
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(-?\d+)(?:-(-?\d+)(?:x(\d+))?)?\s*", part)
+        first, last, step = (match[1], match[2] or match[1], match[3] or 1) if match else (0, -1, 1)
+        numbers = range(int(first), int(last) + 1, max(1, int(step)))
+        if not numbers or int(step) < 1 or len(numbers) > MAX_FRAMES:
+            raise UsdfabError(f"'{text}' names no frames", place="--frames", remedy="write e.g. 1-24, 1-24x2 or 1,5,9")
+        frames.update(dict.fromkeys(numbers))
+    return list(frames)
+
+
+def frame_path(pattern: Path, frame: int) -> Path:
+    """A frame's file: ``out.####.exr`` and ``out.%04d.exr`` are filled in, ``out.exr`` becomes ``out.0007.exr``."""
+
+    def digits(width: int) -> str:
+        return f"{'-' if frame < 0 else ''}{abs(frame):0{width}d}"
+
+    name, count = re.subn(r"#+", lambda m: digits(len(m[0])), pattern.name)
+    if not count:
+        name, count = re.subn(r"%(?:0?(\d+))?d", lambda m: digits(int(m[1] or 1)), pattern.name)
+    return pattern.with_name(name if count else f"{pattern.stem}.{digits(4)}{pattern.suffix}")
+
+
+def parse_tile(text: str | None) -> tuple[int, int] | None:
+    """(i, n) from ``i/n``, 1 <= i <= n."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"\s*(\d+)\s*/\s*(\d+)\s*", text)
+    if not match or not 1 <= int(match[1]) <= int(match[2]):
+        raise UsdfabError(f"'{text}' is no tile", place="--tile", remedy="write i/n with i from 1 to n, e.g. 2/8")
+    return int(match[1]), int(match[2])
 
 
 @contextmanager

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import Parameter
 
 from usdfab.cli.options import (
+    Aov,
     Denoise,
+    Exposure,
     Json,
     OptionalOutput,
     Overwrite,
@@ -16,15 +19,14 @@ from usdfab.cli.options import (
     Resolution,
     Seed,
     Threads,
+    View,
+    frame_path,
+    parse_frames,
+    parse_region,
     parse_resolution,
+    parse_tile,
     print_json,
-    progress_bar,
-    say,
 )
-
-if TYPE_CHECKING:
-    from usdfab.fabric import FabricParameters
-    from usdfab.usd.scene import Scene
 
 
 def run(
@@ -36,12 +38,36 @@ def run(
     rig: Annotated[Path | None, Parameter(help="Capture-rig stage for a swatch: camera, light, plane.")] = None,
     camera: Annotated[str | None, Parameter(help="Prim path of the camera; the stage's first by default.")] = None,
     resolution: Resolution = "640",
-    spp: Annotated[int, Parameter(help="Samples per pixel.")] = 32,
+    region: Annotated[
+        str | None, Parameter(help="Only x0,y0,x1,y1 of the picture, in pixels or percent (25%).")
+    ] = None,
+    spp: Annotated[int, Parameter(help="Samples per pixel; with --noise, the most.")] = 32,
     time: Annotated[float | None, Parameter(help="Seconds after which to stop, if spp are not reached.")] = None,
+    noise: Annotated[
+        float | None, Parameter(help="Relative error to reach, e.g. 0.05; each tile stops when it is there.")
+    ] = None,
     max_depth: Annotated[int, Parameter(help="Longest path; 2 is direct light only.")] = 64,
     time_code: Annotated[float | None, Parameter(help="Time code of the stage to render.")] = None,
-    aov: Annotated[bool, Parameter(negative="", help="EXR only: also albedo, normal, Z, alpha, variance.")] = False,
+    frames: Annotated[
+        str | None, Parameter(help="Time codes A-B or A-BxSTEP, one file each: out.####.exr or out.%04d.exr.")
+    ] = None,
+    aov: Aov = None,
+    exposure: Exposure = None,
+    view: View = None,
     denoise: Denoise = False,
+    checkpoint: Annotated[
+        Path | None, Parameter(help="File for the unfinished render; OUTPUT.partial by default.")
+    ] = None,
+    resume: Annotated[
+        bool, Parameter(negative="", help="Go on with an unfinished render; skip finished frames.")
+    ] = False,
+    tile: Annotated[
+        str | None, Parameter(help="Only part i/n, into OUTPUT.iofn.part; usdfab merge joins the parts.")
+    ] = None,
+    workers: Annotated[int | None, Parameter(help="Render in this many processes (needs the cluster extra).")] = None,
+    scheduler: Annotated[
+        str | None, Parameter(help="Dask scheduler tcp://HOST:PORT whose workers render, or local for processes here.")
+    ] = None,
     seed: Seed = 0,
     threads: Threads = None,
     overwrite: Overwrite = False,
@@ -51,101 +77,63 @@ def run(
     """Render a fabric as a swatch under the capture rig, or a stage whose meshes wear fabrics.
 
     A stage without geometry is taken as a fabric. The same seed gives the same picture, bit for bit, on any number of
-    threads. Pictures are .exr (linear), .png, .jpg or .tif (sRGB).
+    threads or processes, in one piece, in regions, in tiles or resumed. Pictures are .exr (linear), .png, .jpg or .tif
+    (sRGB). A render that is interrupted leaves OUTPUT.partial, from which --resume goes on.
 
     Usage examples:
 
         usdfab render fabric.usda -o swatch.png --resolution 720 --spp 256
-        usdfab render samples/drape.usda --fabric fabric.usda -o drape.exr --resolution 1280x960
+        usdfab render samples/drape.usda --fabric fabric.usda -o drape.exr --resolution 1280x960 --noise 0.05
+        usdfab render walk.usda -o walk.####.exr --frames 1-48 --aov depth,normal --scheduler tcp://farm:8786
 
     Parameters
     ----------
     stage:
         A USD file.
     """
-    from usdfab import imaging
+    from usdfab.cli.picture import picture_options
+    from usdfab.cli.render_files import RenderFile, plan_files
+    from usdfab.cli.scene_source import SceneSource
     from usdfab.errors import UsdfabError
-    from usdfab.files import checked_output
-    from usdfab.imaging.image_output import OUTPUT_SUFFIXES
 
     target = output or Path(stage.stem + ".png")
-    checked_output(target, OUTPUT_SUFFIXES, overwrite=overwrite, kind="images")
-    if aov and target.suffix.lower() != ".exr":
-        raise UsdfabError("only .exr files hold further layers", place="--aov", remedy="write to an .exr file")
-    if denoise:
-        imaging.check_denoiser()
+    options = picture_options(target, aov, denoise, exposure, view, overwrite)
+    part = parse_tile(tile)
+    window = parse_region(region)
     size = parse_resolution(resolution)
+    numbers = parse_frames(frames) if frames is not None else None
     if not 0 <= seed < 2**63:
         raise UsdfabError(f"{seed} is not between 0 and 2^63 - 1", place="--seed")
+    if workers is not None and (workers < 1 or scheduler not in (None, "local")):
+        raise UsdfabError("--workers is a number of processes here, 1 or more", place="--workers")
+    if numbers is not None and (time_code is not None or checkpoint is not None):
+        other = "--time-code" if time_code is not None else "--checkpoint"
+        raise UsdfabError(f"does not go with {other}", place="--frames")
+    pictures = [(target, time_code)] if numbers is None else [(frame_path(target, n), float(n)) for n in numbers]
+    files = plan_files(pictures, part, checkpoint, resume, overwrite)
 
-    scene, override = _scene(stage, fabric, rig, camera, time_code)
-    from usdfab.tracer import RenderSettings, Tracer
+    from usdfab.cli.cluster import dask_executor
+    from usdfab.cli.render_frame import FrameOptions, render_frame
+    from usdfab.tracer.render import RenderSettings, thread_count
 
-    if not scene.cameras:
-        raise UsdfabError("the stage has no camera", place=str(stage), remedy="add a UsdGeomCamera")
-    if not quiet:
-        for warning in scene.warnings:
-            say(f"warning: {warning}")
-    settings = RenderSettings(size, spp, max_depth, seed, threads, time)
-    with progress_bar(f"rendering {target.name}", quiet=quiet) as update:
-        result = Tracer(scene, _textures(scene)).render(scene.cameras[0], settings, update)
-    aovs = None
-    if aov:
-        aovs = {
-            "albedo": result.albedo,
-            "normal": result.normal,
-            "Z": result.depth,
-            "alpha": result.alpha,
-            "variance": result.variance,
-        }
-    pixels = result.pixels
-    if denoise:
-        pixels = imaging.denoise(pixels, result.albedo, result.normal)
-    imaging.write_image(target, pixels, overwrite=overwrite, aovs=aovs)
-    height, width = result.pixels.shape[:2]
+    settings = RenderSettings(size, spp, max_depth, seed, thread_count(threads), time, noise, part=part or (1, 1))
+    texts = {"stage": stage, "fabric": fabric, "rig": rig}
+    names = {name: str(path.absolute()) if path is not None else None for name, path in texts.items()}
+
+    def source(file: RenderFile) -> SceneSource:
+        return SceneSource(str(stage.absolute()), names["fabric"], names["rig"], camera, file.time_code)
+
+    results, warnings, worn = [], [], None
+    place = "local" if scheduler is None and workers is not None else scheduler
+    idle = place is None or all(file.finished for file in files)
+    with nullcontext() if idle else dask_executor(str(place), workers, thread_count(threads)) as remote:
+        for k, file in enumerate(files):
+            label = f"rendering {file.output.name}" + (f" ({k + 1} of {len(files)})" if len(files) > 1 else "")
+            frame = FrameOptions(settings, window, options, resume, label, quiet, json)
+            facts, said, worn_here = render_frame(source(file), file, frame, remote)
+            results.append(facts)
+            warnings += [warning for warning in said if warning not in warnings]
+            worn = worn_here or worn
     if json:
-        print_json(
-            {
-                "output": target,
-                "width": width,
-                "height": height,
-                "spp": result.spp,
-                "seconds": round(result.seconds, 3),
-                "rays": result.rays,
-                "fiber_segments": result.patch_segments,
-                "fabric": override.name if override else None,
-                "warnings": scene.warnings,
-            }
-        )
-    elif not quiet:
-        rate = result.rays / max(result.seconds, 1e-9) / 1e6
-        say(f"wrote {target}: {width} x {height}, {result.spp} spp, {result.seconds:.1f} s, {rate:.2f} million rays/s")
-
-
-def _scene(
-    stage: Path, fabric: Path | None, rig: Path | None, camera: str | None, time_code: float | None
-) -> tuple[Scene, FabricParameters | None]:
-    """The scene to render, and the fabric that was put on it, if any."""
-    from usdfab.errors import UsdfabError
-    from usdfab.usd.fabric_io import fabric_prims, read_fabric
-    from usdfab.usd.read_scene import read_scene
-    from usdfab.usd.rig import swatch_scene
-    from usdfab.usd.stage import has_geometry, open_stage
-
-    opened = open_stage(stage)
-    if not has_geometry(opened) and fabric_prims(opened):
-        if fabric is not None:
-            raise UsdfabError("--fabric needs a stage with cloth to put it on", place=str(stage))
-        return swatch_scene(read_fabric(stage), rig), None
-    if rig is not None:
-        raise UsdfabError("--rig is for fabrics; this stage has geometry of its own", place=str(stage))
-    override = read_fabric(fabric) if fabric is not None else None
-    return read_scene(stage, time_code, camera, override), override
-
-
-def _textures(scene: Scene) -> dict:
-    from usdfab.imaging import read_image
-    from usdfab.usd.scene import DomeLight
-
-    paths = [light.texture_path for light in scene.lights if isinstance(light, DomeLight) and light.texture_path]
-    return {path: read_image(path).pixels for path in paths}
+        common = {"outputs": [file.output for file in files], "fabric": worn, "warnings": warnings}
+        print_json(results[0] | common if numbers is None else {"frames": results} | common)

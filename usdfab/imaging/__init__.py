@@ -10,3 +10,4 @@ from usdfab.imaging.image_file import Image as Image, read_image as read_image, 
 from usdfab.imaging.image_output import encoded as encoded, write_image as write_image
 from usdfab.imaging.layout import grid as grid, side_by_side as side_by_side
 from usdfab.imaging.metrics import mse as mse, psnr as psnr, relmse as relmse
+from usdfab.imaging.view import VIEWS as VIEWS, view_transform as view_transform

@@ -19,8 +19,9 @@ def check_denoiser() -> None:
 def denoise(pixels: ArrayLike, albedo: ArrayLike, normal: ArrayLike) -> NDArray[np.float32]:
     """A linear picture without its sampling noise, (H, W, 3) float32.
 
-    The guides keep single fibers apart, which the denoiser would otherwise smear. A denoised picture is pleasant to
-    look at but biased: measure on the original.
+    The guides keep single fibers apart, which the denoiser would otherwise smear. They go in as they are: denoising
+    them first changed the error by +4 % at 4 and -1 % at 16 samples per pixel on a woven swatch. A denoised picture is
+    pleasant to look at but biased: measure on the original.
 
     Parameters
     ----------

@@ -18,8 +18,8 @@ from usdfab.imaging.resolution import PixelSize, pixel_size_from_tags
 MAX_SIDE = 20_000
 """Longest side that is read, in pixels."""
 
-VECTOR_LAYER_CHANNELS = (("R", "G", "B"), ("X", "Y", "Z"))
-"""Channel endings that make up one layer of three."""
+VECTOR_LAYER_CHANNELS = (("R", "G", "B"), ("X", "Y", "Z"), ("U", "V"))
+"""Channel endings that make up one layer of three or two."""
 
 _HARMLESS = ("extraneous bytes before marker",)
 """JPEG complaints about pictures that are whole all the same; cheap microscopes write such files."""
@@ -108,7 +108,8 @@ def read_layers(path: str | Path) -> dict[str, NDArray[np.float32]]:
     """All layers of an EXR file by name, as ``write_image`` writes them.
 
     The picture itself is called ``""``; ``albedo.R``, ``albedo.G``, ``albedo.B`` become ``albedo`` of shape
-    (H, W, 3), a single channel such as ``Z`` has shape (H, W). Values are as stored, float32; infinite ones are kept.
+    (H, W, 3), ``uv.U`` and ``uv.V`` become ``uv`` of shape (H, W, 2), a single channel such as ``Z`` has shape (H, W).
+    Values are as stored, float32; infinite ones are kept.
 
     Raises
     ------

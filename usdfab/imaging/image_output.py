@@ -26,6 +26,9 @@ REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """x, y of red, green, blue and white (BT.709-6), for the EXR header."""
 
 _XYZ_LAYERS = frozenset({"normal", "position", "tangent", "velocity"})
+_PRECISE_LAYERS = frozenset({"position", "velocity", "variance"})
+"""Layers of three that 16-bit floats would spoil: large numbers, and squares of small ones."""
+Offset = tuple[int, int]
 _TIFF_CHATTER = "failed TIFFWriteCustomDirectory() of the Exif data"  # said of every TIFF without EXIF data
 
 
@@ -39,6 +42,8 @@ def write_image(
     half: bool = True,
     bits: int = 8,
     metadata: Mapping[str, str] | None = None,
+    offset: Offset = (0, 0),
+    full_size: tuple[int, int] | None = None,
 ) -> Path:
     """Write a picture. The file appears only when it is complete; after an error, what was there before is still there.
 
@@ -55,8 +60,9 @@ def write_image(
         Replace an existing file.
     aovs:
         Further layers, EXR only. ``{"albedo": (H, W, 3)}`` becomes the channels ``albedo.R``, ``.G``, ``.B``; normal,
-        position, tangent and velocity get ``.X``, ``.Y``, ``.Z``; (H, W) becomes one channel of that name, such as
-        ``Z``. Colours, normals and tangents are stored like the picture, all else as 32-bit floats.
+        position, tangent and velocity get ``.X``, ``.Y``, ``.Z``; (H, W, 2) gets ``.U``, ``.V``; (H, W) becomes one
+        channel of that name, such as ``Z``, ``A`` being the picture's alpha. Colours, normals and tangents are stored
+        like the picture, all else, variance too, as 32-bit floats.
     pixel_size: (width, height) metres
         Written into the resolution tags.
     half:
@@ -65,6 +71,9 @@ def write_image(
         PNG and TIFF: 8 or 16. JPEG is always 8.
     metadata:
         Text attributes for the header, such as ``{"Software": "usdfab 0.1"}``.
+    offset, full_size: (x, y), (width, height)
+        Where in a larger picture these pixels belong: EXR's data window in its display window. Other kinds of files
+        hold the pixels alone.
 
     Returns
     -------
@@ -94,6 +103,11 @@ def write_image(
     spec.channelnames = tuple(names)
     if len(set(kinds)) > 1:
         spec.channelformats = tuple(oiio.TypeDesc(kind) for kind in kinds)
+    if "A" in names:
+        spec.alpha_channel = names.index("A")
+    if suffix == ".exr" and full_size is not None:
+        spec.x, spec.y = offset
+        spec.full_x, spec.full_y, spec.full_width, spec.full_height = 0, 0, *full_size
     _describe(spec, suffix, pixel_size, metadata or {})
     _save(oiio, target, spec, data)
     return target
@@ -129,16 +143,19 @@ def _exr_channels(
     layers, names, kinds = [picture], ["R", "G", "B"], [small] * 3
     for name, values in aovs.items():
         layer = np.asarray(values, dtype=np.float32)
-        if layer.shape not in (picture.shape, picture.shape[:2]):
+        if layer.shape not in (picture.shape, picture.shape[:2], (*picture.shape[:2], 2)):
             raise UsdfabError(f"layer {name} has shape {layer.shape}, the picture {picture.shape}", place=place)
         if np.isnan(layer).any():
             raise UsdfabError(f"layer {name} has NaN pixels", place=place)
         if layer.ndim == 2:
             names.append(name)
             kinds.append("float")
+        elif layer.shape[-1] == 2:
+            names += [f"{name}.U", f"{name}.V"]
+            kinds += ["float"] * 2
         else:
             names += [f"{name}.{axis}" for axis in ("XYZ" if name in _XYZ_LAYERS else "RGB")]
-            kinds += ["float" if name in ("position", "velocity") else small] * 3
+            kinds += ["float" if name in _PRECISE_LAYERS else small] * 3
         layers.append(layer.reshape(*picture.shape[:2], -1))
     if "" in aovs or len(set(names)) < len(names):
         raise UsdfabError(f"layers {', '.join(aovs)} do not all have names of their own", place=place)

@@ -33,7 +33,7 @@ from usdfab.tracer.lights import FAR, escaped_radiance, hit_light, light_blocks,
 from usdfab.tracer.slab import HIT, enter_slab, inverse_columns, leave_slab, slab_occluded, to_patch, trace_slab
 from usdfab.tracer.surfaces import MAX_SURFACES, surface_frame, trace_macro, transmittance
 from usdfab.tracer.textures import lookup, normal_at, opacity_at, surface_at
-from usdfab.tracer.world import ALBEDO_MAP, FIRST_PATCH, FIRST_SEGMENT, borrowed
+from usdfab.tracer.world import ALBEDO_MAP, FIRST_CURVE, FIRST_PATCH, FIRST_SEGMENT, borrowed
 
 RUSSIAN_ROULETTE_DEPTH = 5
 SHADOW_ROULETTE = 2.0 * math.pi
@@ -67,11 +67,7 @@ def _shading_frame(nx, ny, nz, gx, gy, gz, hx, hy, hz, mapped, mx, my, mz):
     sign = math.copysign(1.0, nz)
     a = -1.0 / (sign + nz)
     b = nx * ny * a
-    return (
-        *(1.0 + sign * nx * nx * a, sign * b, -sign * nx),
-        *(b, sign + ny * ny * a, -ny),
-        *(nx, ny, nz),
-    )
+    return 1.0 + sign * nx * nx * a, sign * b, -sign * nx, b, sign + ny * ny * a, -ny, nx, ny, nz
 
 
 @njit(cache=True, inline="always")
@@ -107,6 +103,18 @@ def _absorption(sigma, inverse_q, tint, albedo):
     """Absorption of a fiber whose albedo coefficient is multiplied by ``tint`` (Chiang et al. 2015; at most 1)."""
     root = math.sqrt(sigma) - math.log(min(max(tint, 1e-4), 1.0 / max(albedo, 1e-4))) * inverse_q
     return root * root if root > 0.0 else 0.0
+
+
+@njit(cache=True, inline="always")
+def _tinted(p, albedo, row, r, g, b):
+    """The packed fiber material ``p`` with its albedo coefficient multiplied."""
+    q = albedo[row, 3]
+    absorption = (
+        _absorption(p[0], q, r, albedo[row, 0]),
+        _absorption(p[1], q, g, albedo[row, 1]),
+        _absorption(p[2], q, b, albedo[row, 2]),
+    )
+    return absorption + p[3:]
 
 
 @njit(cache=True)
@@ -239,13 +247,7 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
             nx, ny, nz = nx * norm, ny * norm, nz * norm
             fiber_material = load_fiber(patches.materials, row)
             if tinted:
-                q = patches.albedo[row, 3]
-                fiber_material = (
-                    _absorption(fiber_material[0], q, tint_r, patches.albedo[row, 0]),
-                    _absorption(fiber_material[1], q, tint_g, patches.albedo[row, 1]),
-                    _absorption(fiber_material[2], q, tint_b, patches.albedo[row, 2]),
-                    *fiber_material[3:],
-                )
+                fiber_material = _tinted(fiber_material, patches.albedo, row, tint_r, tint_g, tint_b)
             sin_to, cos_to, h, ex, ey, ez, fx, fy, fz = fiber_frame(ax, ay, az, nx, ny, nz, -dx, -dy, -dz)
             prepared = prepare_fiber(fiber_material, h, sin_to, cos_to)
             if first:
@@ -254,7 +256,8 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                 out[ALBEDO + 2] += min(tint_b * patches.albedo[row, 2], 1.0)
                 if set_ids:
                     out[FIBER_ID] = c[segment, 7]
-                    out[YARN_ID] = patches.yarns[np.int64(c[segment, 7]) - 1]
+                    curve = np.int64(patches.table[patch, FIRST_CURVE]) + np.int64(c[segment, 7]) - 1
+                    out[YARN_ID] = patches.yarns[curve]
         else:
             packed, er, eg, eb = surface_at(world.materials, world.textures, material, tx, ty)
             mapped, qx, qy, qz = normal_at(world.materials, world.textures, material, tx, ty)
@@ -334,7 +337,9 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                                 0.0, reach - start, slab_mesh, back + 2.0 * thickness,
                             )  # fmt: skip
                     else:
-                        share = transmittance(world, buffer, time, ox, oy, oz, wx, wy, wz, near, reach, np.int64(-1), 0.0)
+                        share = transmittance(
+                            world, buffer, time, ox, oy, oz, wx, wy, wz, near, reach, np.int64(-1), 0.0
+                        )
                     cr, cg, cb = share * cr, share * cg, share * cb
                     total_r, total_g, total_b = total_r + cr, total_g + cg, total_b + cb
                     if depth == 1:

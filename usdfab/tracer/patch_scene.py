@@ -6,14 +6,18 @@ whose vertices lie on the spline, with the spline's tangent kept at each vertex,
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.fabric import FabricParameters, YarnParameters
-from usdfab.fibers import FiberSystem, OpenCurves, Patch, generate_patch
+from usdfab.fibers import FiberSystem, OpenCurves, Patch, generate_patch, patch_variants
 from usdfab.scattering.fiber_numba import pack_fiber
+from usdfab.scattering.roughness import absorption_from_albedo
 from usdfab.tracer.embree import NEIGHBOR_LEFT, NEIGHBOR_RIGHT, EmbreeScene, curve_scene
 
 TILE_CELLS = 4
@@ -26,26 +30,41 @@ metres, with fibers of 1e-5, it returns wrong places along the segment."""
 MAX_TILE_SEGMENTS = 1_500_000
 """Beyond this a tile stays at one repeat of the weave."""
 
+BEND = 0.03
+"""How far, in fiber radii, a straight segment may be from the spline: knots in between are left out."""
+
 
 @dataclass(frozen=True)
 class PatchScene:
     """One tile, ready for the kernels. Lengths in units of which ``units_per_meter`` make a metre.
 
-    ``tangents`` (V, 3) float32 unit; ``segment_vertex`` (S,) first vertex of each segment; ``segment_material`` (S,)
-    row of ``materials`` (M, N), each packed by ``pack_fiber``; ``albedo`` (M, 3) the fiber albedo coefficients.
+    ``segments`` (S, 8) float32: the spline's unit tangents at both ends of each segment, row of ``materials``, 1 +
+    curve; ``materials`` (M, N) packed by ``pack_fiber``; ``albedo`` (M, 4) fiber albedo coefficients and
+    1 / q(gamma_N); ``yarns`` (curves,) 1 + yarn, warp first, then weft.
     """
 
     size: tuple[float, float]
     z_range: tuple[float, float]
     scene: EmbreeScene
-    tangents: NDArray[np.float32]
-    segment_vertex: NDArray[np.int32]
-    segment_material: NDArray[np.int32]
+    segments: NDArray[np.float32]
     materials: NDArray[np.float64]
     albedo: NDArray[np.float64]
+    yarns: NDArray[np.int32]
     units_per_meter: float
     epsilon: float
     """Shortest ray: hits nearer than this are the surface the ray starts on."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of vertices, indices and records; Embree's hierarchy comes on top."""
+        return self.scene.nbytes + self.segments.nbytes + self.materials.nbytes + self.yarns.nbytes
+
+
+def build_tiles(fabric: FabricParameters) -> list[PatchScene]:
+    """The tiles of a fabric: its variants, any of which can stand anywhere. The first is that of ``variants`` = 1."""
+    patches = patch_variants(fabric, copies=tile_copies(fabric))
+    with ThreadPoolExecutor(min(len(patches), os.cpu_count() or 1)) as pool:
+        return list(pool.map(partial(build_patch_scene, fabric), patches))
 
 
 def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> PatchScene:
@@ -54,7 +73,7 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
         patch = generate_patch(fabric, copies=tile_copies(fabric))
     radius = min(s.radius for s in patch.systems)
     units = FIBER_RADIUS_UNITS / radius
-    vertices, tangents, first, flags, material = [], [], [], [], []
+    vertices, first, flags, segments, yarns = [], [], [], [], []
     materials: list[NDArray] = []
     albedo: list[tuple[float, ...]] = []
     base = 0
@@ -63,13 +82,17 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
         colors, color_of_curve = np.unique(system.albedo, axis=0, return_inverse=True)
         v, t, f, g, curve = _tile_segments(system, patch.size)
         vertices.append(units * np.c_[v, np.full(len(v), system.radius)])
-        tangents.append(t)
         first.append(f + base)
         flags.append(g)
-        material.append(color_of_curve.reshape(-1)[curve] + len(materials))
+        row = color_of_curve.reshape(-1)[curve] + len(materials)
+        number = 1 + curve + sum(len(y) for y in yarns)
+        segments.append(np.c_[t[f], t[f + 1], row, number])
+        yarns.append(system.yarn + (1 if system.system == "warp" else 1 + int(patch.warp.yarn.max())))
         base += len(v)
         materials.extend(_pack(yarn, tuple(c)) for c in colors)
-        albedo.extend(tuple(c) for c in colors)
+        # What turns ln C into the root of the absorption.
+        inverse_q = float(np.sqrt(absorption_from_albedo(np.exp(-1.0), yarn.roughness_azimuthal)))
+        albedo.extend((*c, inverse_q) for c in colors)
     segment_vertex = np.concatenate(first).astype(np.int32)
     scene = curve_scene(np.concatenate(vertices), segment_vertex, np.concatenate(flags))
     low, high = patch.z_range
@@ -77,11 +100,10 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
         size=(units * patch.size[0], units * patch.size[1]),
         z_range=(units * (low - 1e-3 * radius), units * (high + 1e-3 * radius)),
         scene=scene,
-        tangents=np.concatenate(tangents).astype(np.float32),
-        segment_vertex=segment_vertex,
-        segment_material=np.concatenate(material).astype(np.int32),
+        segments=np.concatenate(segments).astype(np.float32),
         materials=np.stack(materials),
         albedo=np.asarray(albedo),
+        yarns=np.concatenate(yarns).astype(np.int32),
         units_per_meter=units,
         epsilon=5e-3 * FIBER_RADIUS_UNITS,
     )
@@ -131,6 +153,28 @@ def _spline_vertices(control: NDArray, offsets: NDArray[np.int64]) -> tuple[NDAr
     return points[inner], tangents[inner], np.r_[0, np.cumsum(lengths - 2)]
 
 
+def _sparse(system: FiberSystem) -> tuple[NDArray, NDArray, NDArray[np.int64]]:
+    """``spline_vertices`` without the knots that a straight segment does as well without (``BEND``).
+
+    The spare vertices before and after each curve stay, so do its ends. Knots are chosen so that the integral of
+    sqrt(curvature / 8 BEND r) between them is 1: a chord of length L over a bend of curvature k is L^2 k / 8 away.
+    """
+    points, tangents, offsets = spline_vertices(system)
+    length = np.linalg.norm(np.diff(points, axis=0, append=points[-1:]), axis=1)
+    turn = np.linalg.norm(np.diff(tangents, axis=0, append=tangents[-1:]), axis=1)
+    need = np.clip(np.sqrt(turn * length / (8.0 * BEND * system.radius)), 1.0 / 16.0, 1.0)
+    curve = np.repeat(np.arange(system.curves), np.diff(offsets))
+    place = np.arange(len(points)) - offsets[:-1][curve]
+    count = np.diff(offsets)[curve]
+    before = np.cumsum(need) - need
+    start, end = before[offsets[:-1] + 1], before[offsets[1:] - 3]
+    # A whole number of segments on each curve, all equally demanding.
+    whole = np.maximum(np.ceil(end - start - 1e-9), 1.0)
+    number = np.floor((before - start[curve]) * (whole / np.maximum(end - start, 1e-12))[curve] + 1e-6)
+    keep = (place <= 1) | (place >= count - 3) | (number != np.r_[-1.0, number[:-1]])
+    return points[keep], tangents[keep], np.r_[0, np.cumsum(np.add.reduceat(keep.astype(np.int64), offsets[:-1]))]
+
+
 def _tile_segments(
     system: FiberSystem | OpenCurves, size: tuple[float, float]
 ) -> tuple[NDArray, NDArray, NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]:
@@ -139,7 +183,7 @@ def _tile_segments(
     Returns vertices (V, 3), tangents (V, 3), first vertex (S,), neighbour flags (S,) and curve (S,).
     """
     points, tangents, offsets = (
-        _spline_vertices(*system.pinned()) if isinstance(system, OpenCurves) else spline_vertices(system)
+        _spline_vertices(*system.pinned()) if isinstance(system, OpenCurves) else _sparse(system)
     )
     curve_of_vertex = np.repeat(np.arange(system.curves), np.diff(offsets))
     place = np.arange(len(points)) - offsets[:-1][curve_of_vertex]

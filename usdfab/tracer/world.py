@@ -13,8 +13,11 @@ from usdfab.tracer.lights import Lights
 from usdfab.tracer.textures import Materials, Textures
 
 # Columns of ``Patches.table``. Lengths in patch units.
-WIDTH, HEIGHT, LOW, HIGH, EPSILON, FIRST_SEGMENT, UNITS = 0, 1, 2, 3, 4, 5, 6
-PATCH_COLUMNS = 7
+WIDTH, HEIGHT, LOW, HIGH, EPSILON, FIRST_SEGMENT, UNITS, FIRST_CURVE = 0, 1, 2, 3, 4, 5, 6, 7
+PATCH_COLUMNS = 8
+
+# Columns of ``Patches.segments`` after the tangents.
+MATERIAL_OF_SEGMENT, CURVE_OF_SEGMENT = 6, 7
 
 # Columns of ``Macro.fabrics``.
 FIRST_PATCH, VARIANTS, UV_SCALE, ALBEDO_MAP = 0, 1, 2, 3
@@ -27,18 +30,19 @@ class Patches(NamedTuple):
     Parameters
     ----------
     table: (P, PATCH_COLUMNS)
-        Size and lowest and highest place of the tile, shortest ray, first segment, patch units per metre.
+        Size and lowest and highest place of the tile, shortest ray, first segment, patch units per metre,
+        first of its curves in ``yarns``.
     handles: (P,)
         Embree scenes.
     segments: (S, 8) float32
-        The spline's unit tangents at both ends (6), row of ``materials``, 1 + curve: all that a hit needs, in one
-        cache line.
+        The spline's unit tangents at both ends (6), row of ``materials``, 1 + curve of the patch: all that a hit
+        needs, in one cache line.
     materials: (M, FIBER_SIZE)
         Packed by ``pack_fiber``.
     albedo: (M, 4)
         Fiber albedo coefficient C (3) and 1 / q(gamma_N), with which C becomes absorption.
     yarns: (C,) int32
-        1 + yarn of each curve, warp first; curves of all patches after another, see ``segments``.
+        1 + yarn of each curve, warp first; all patches, one after the other.
     """
 
     table: NDArray[np.float64]
