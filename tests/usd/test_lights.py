@@ -177,7 +177,7 @@ def test_dome_texture_path_is_resolved(tmp_path):
     assert read(stage)[0].texture_path == str(tmp_path / "sky.exr")
 
 
-@pytest.mark.parametrize("kind", ["DiskLight", "CylinderLight", "PortalLight", "GeometryLight"])
+@pytest.mark.parametrize("kind", ["PortalLight", "GeometryLight"])
 def test_unsupported_lights_are_named(kind):
     light, warnings = read(stage_with(kind)[0])
     assert light is None

@@ -97,6 +97,9 @@ class FabricParameters:
         The two yarn systems.
     seed:
         Fixes every random draw of the fibers.
+    albedo_map:
+        Path of an image that multiplies the fiber albedo, looked up with the texture coordinates of the cloth; empty
+        for none.
     """
 
     weave: Weave = field(default_factory=plain)
@@ -106,6 +109,7 @@ class FabricParameters:
     seed: int = 0
     name: str = "Fabric"
     provenance: Provenance = field(default_factory=Provenance)
+    albedo_map: str = ""
 
     def __post_init__(self) -> None:
         if len(self.size) != 2:
@@ -201,8 +205,8 @@ def _check_range(parameter: Parameter, number: float, place: str) -> None:
 def edited(fabric: FabricParameters, settings: Mapping[str, str]) -> FabricParameters:
     """``fabric`` with settings such as ``{"warp.albedo": ".1,.2,.5", "weave": "twill 2/2"}`` applied.
 
-    Names: ``weave``, ``size`` (two lengths, in metres or with a unit), ``seed``, ``name``, and ``warp.NAME`` or
-    ``weft.NAME`` or ``both.NAME`` for each row of the parameter table.
+    Names: ``weave``, ``size`` (two lengths, in metres or with a unit), ``seed``, ``name``, ``albedo_map`` (a file), and
+    ``warp.NAME`` or ``weft.NAME`` or ``both.NAME`` for each row of the parameter table.
 
     Raises
     ------
@@ -225,12 +229,14 @@ def _edited_once(fabric: FabricParameters, key: str, text: str) -> FabricParamet
         return replace(fabric, seed=int(text))
     if key == "name":
         return replace(fabric, name=text)
+    if key == "albedo_map":
+        return replace(fabric, albedo_map=text)
     system, _, name = key.partition(".")
     if system not in ("warp", "weft", "both") or name not in PARAMETER_BY_NAME:
         known = ", ".join(p.name for p in YARN_PARAMETERS)
         raise UsdfabError(
             f"unknown parameter '{key}'",
-            remedy=f"use weave, size, seed, name, or warp., weft. or both. followed by one of: {known}",
+            remedy=f"use weave, size, seed, name, albedo_map, or warp., weft. or both. followed by one of: {known}",
         )
     value = _parse_value(PARAMETER_BY_NAME[name], text, key)
     changes = {s: replace(fabric.system(s), **{name: value}) for s in SYSTEMS if system in (s, "both")}
@@ -298,6 +304,7 @@ def as_table(fabric: FabricParameters) -> dict[str, Any]:
         },
         "size_m": list(fabric.size),
         "seed": fabric.seed,
+        "albedo_map": fabric.albedo_map,
         "warp": yarn(fabric.warp),
         "weft": yarn(fabric.weft),
         "provenance": {
