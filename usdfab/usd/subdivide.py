@@ -203,7 +203,10 @@ def face_varying(
     owner = mesh.indices[first]
     number = len(unique)
     bare = topology(mesh.counts, indices, number, sharp_boundary_corners=rule != "none")
-    corner = np.maximum(bare.corner_sharpness, mesh.corner_sharpness[owner] * (mesh.corner_sharpness[owner] < np.inf))
+    inherited = mesh.corner_sharpness[owner]
+    if rule == "none":
+        inherited = np.where(np.isinf(inherited), 0.0, inherited)
+    corner = np.maximum(bare.corner_sharpness, inherited)
     if rule == "boundaries":
         corner[bare.edges[~bare.regular].ravel()] = np.inf
     elif rule in ("cornersPlus1", "cornersPlus2"):
