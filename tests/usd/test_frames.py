@@ -54,7 +54,9 @@ def test_nonsense(stage, text):
         frame_times(stage, text)
 
 
-@pytest.mark.parametrize(("text", "problem"), [("1-5x0", "a step of 0"), ("1-5x-1", "a step of -1"), ("0-1e", "'0-1e'")])
+@pytest.mark.parametrize(
+    ("text", "problem"), [("1-5x0", "a step of 0"), ("1-5x-1", "a step of -1"), ("0-1e", "'0-1e'")]
+)
 def test_bad_steps(stage, text, problem):
     with pytest.raises(UsdfabError, match=problem):
         frame_times(stage, text)

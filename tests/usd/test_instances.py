@@ -117,12 +117,12 @@ def test_point_instancers(new_mesh):
     square = np.array(SQUARE, dtype=float)
     found = placed_points(a)
     for copy, x in zip(found[:4], (0, 1, 3, 4), strict=True):
-        np.testing.assert_allclose(copy, square + [x, 100, 0], atol=1e-9)
+        np.testing.assert_allclose(copy, square + np.array([x, 100, 0]), atol=1e-9)
     turned = square[:, [1, 0, 2]] * [-1, 1, 1]
-    np.testing.assert_allclose(found[4], turned + [5, 100, 0], atol=2e-3)  # half-precision quaternions
+    np.testing.assert_allclose(found[4], turned + np.array([5, 100, 0]), atol=2e-3)  # half-precision quaternions
     # the prototype's own transform is scaled with the copy: z = 3 * 5
-    np.testing.assert_allclose(m0.points, square + [2, 100, 15])
-    np.testing.assert_allclose(m1.points, square + [2, 101, 15])
+    np.testing.assert_allclose(m0.points, square + np.array([2, 100, 15]))
+    np.testing.assert_allclose(m1.points, square + np.array([2, 101, 15]))
     assert scene.warnings == ()
 
 

@@ -38,7 +38,8 @@ def looks(tmp_path, new_mesh):
 
 def connect(surface, name, texture, output="rgb"):
     kind = T.Color3f if output == "rgb" else T.Float
-    surface.CreateInput(name, kind).ConnectToSource(texture.CreateOutput(output, T.Float3 if output == "rgb" else T.Float))
+    source = texture.CreateOutput(output, T.Float3 if output == "rgb" else T.Float)
+    surface.CreateInput(name, kind).ConnectToSource(source)
 
 
 def only_material(stage, **options):
@@ -204,7 +205,7 @@ def test_bad_values_have_the_default(looks):
     np.testing.assert_allclose(scene.materials[0].base_color, 0.18)
     assert scene.materials[0].roughness == 0.5
     assert [w.partition(":")[0] for w in scene.warnings] == ["/Look/S.inputs"] * 2
-    with pytest.raises(UsdfabError, match="/Look/S.inputs:diffuseColor: expected 3 finite numbers"):
+    with pytest.raises(UsdfabError, match=r"/Look/S\.inputs:diffuseColor: expected 3 finite numbers"):
         read_scene(stage, strict=True)
 
 
@@ -270,7 +271,7 @@ def test_albedo_map(tmp_path, fabric, new_mesh):
     scene = read_scene(stage)
     assert scene.fabrics[0].albedo_map is None
     assert f"the albedo map {file} does not exist" in scene.warnings[0]
-    with pytest.raises(UsdfabError, match="albedo map .* does not exist"):
+    with pytest.raises(UsdfabError, match=r"albedo map .* does not exist"):
         read_scene(stage, strict=True)
 
 

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings, strategies as st
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, Vt
 
 from usdfab.errors import UsdfabError
@@ -485,6 +486,106 @@ def test_singular_transforms_leave_the_mesh_out(cloth_stage, new_mesh):
     assert "/World/Flat>: the transform is singular; the mesh is left out" in scene.warnings[0]
     with pytest.raises(UsdfabError, match="/World/Flat>: the transform is singular"):
         read_scene(cloth_stage, strict=True)
+
+
+def test_degenerate_meshes_and_transforms_without_numbers(cloth_stage, new_mesh):
+    new_mesh(cloth_stage, "/World/Line", [(0, 0, 0), (1, 0, 0), (2, 0, 0)], [[0, 1, 2]])
+    lost = new_mesh(cloth_stage, "/World/Lost", SQUARE, [[0, 1, 2, 3]])
+    UsdGeom.Xformable(lost).AddTranslateOp().Set(Gf.Vec3d(math.nan, 0, 0))
+    scene = read_scene(cloth_stage)
+    assert [m.path for m in scene.meshes] == ["/World/Cloth"]
+    text = "\n".join(scene.warnings)
+    assert "/World/Line>: the mesh has no area; the mesh is left out" in text
+    assert "/World/Lost>: the transform is not finite; the mesh is left out" in text
+    for path, problem in (("/World/Line", "no area"), ("/World/Lost", "not finite")):
+        cloth_stage.GetPrimAtPath("/World/Line").SetActive(path == "/World/Line")
+        with pytest.raises(UsdfabError, match=f"{path}>: .*{problem}"):
+            read_scene(cloth_stage, strict=True)
+
+
+NUMBERS = st.sampled_from([0.0, 1.0, -1.0, 0.5, 3.0, 1e30, math.nan, math.inf])
+INDICES = st.lists(st.integers(-2, 9), max_size=12)
+
+
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    points=st.lists(st.tuples(NUMBERS, NUMBERS, NUMBERS), max_size=8),
+    counts=st.lists(st.integers(-1, 5), max_size=4),
+    indices=INDICES,
+    uv=st.lists(st.tuples(NUMBERS, NUMBERS), max_size=8),
+    holes=INDICES,
+    interpolation=st.sampled_from(["vertex", "faceVarying", "constant", "uniform", "nonsense"]),
+    scheme=st.sampled_from(["none", "catmullClark", "loop", "bilinear"]),
+    scale=st.tuples(NUMBERS, NUMBERS, NUMBERS),
+    bound=st.booleans(),
+)
+def test_nonsense_never_crashes(
+    cloth_stage, new_mesh, points, counts, indices, uv, holes, interpolation, scheme, scale, bound
+):
+    cloth_stage.RemovePrim("/World/Bad")
+    mesh = UsdGeom.Mesh.Define(cloth_stage, "/World/Bad")
+    mesh.CreatePointsAttr([Gf.Vec3f(*p) for p in points])
+    mesh.CreateFaceVertexCountsAttr(counts)
+    mesh.CreateFaceVertexIndicesAttr(indices)
+    mesh.CreateHoleIndicesAttr(holes)
+    mesh.CreateCreaseIndicesAttr(indices)
+    mesh.CreateCreaseLengthsAttr([2])
+    mesh.CreateCreaseSharpnessesAttr([3.0])
+    mesh.CreateSubdivisionSchemeAttr(scheme)
+    UsdGeom.Xformable(mesh).AddScaleOp().Set(Gf.Vec3f(*scale))
+    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray)
+    primvar.GetAttr().SetMetadata("interpolation", interpolation)
+    primvar.Set([Gf.Vec2f(*c) for c in uv])
+    if bound:
+        bind(mesh, UsdShade.Material(cloth_stage.GetPrimAtPath("/World/Looks/Fabric")))
+    scene = read_scene(cloth_stage)
+    assert scene.meshes[0].path == "/World/Cloth"
+    for found in scene.meshes:
+        assert np.isfinite(found.points).all()
+        assert found.triangles.max() < len(found.points)
+    # what is drawn without a word when tolerant is no error when strict, and the other way round
+    try:
+        strict = read_scene(cloth_stage, strict=True)
+    except UsdfabError as error:
+        assert scene.warnings and error.problem in " ".join(scene.warnings)
+    else:
+        assert len(strict.meshes) == len(scene.meshes)
+
+
+def test_attributes_of_another_type(cloth_stage):
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.ImportFromString(
+        """#usda 1.0
+        over "World" {
+            def Mesh "Bad" {
+                string[] points = ["a"]
+                int[] faceVertexCounts = [3]
+                float[] faceVertexIndices = [0.5, 1, 2]
+                string primvars:st = "uv"
+                bool doubleSided = 1
+            }
+            def Mesh "Worse"
+            {
+                string subdivisionScheme = "none"
+                double3 points = (1, 2, 3)
+                int[] faceVertexCounts = [3]
+                int[] faceVertexIndices = [0, 0, 0]
+            }
+            def Camera "Odd"
+            {
+                string focalLength = "long"
+            }
+            def SphereLight "Lamp"
+            {
+                string inputs:radius = "big"
+                asset inputs:intensity = @x@
+            }
+        }"""
+    )
+    cloth_stage.GetRootLayer().subLayerPaths.append(layer.identifier)
+    scene = read_scene(cloth_stage)
+    assert [m.path for m in scene.meshes] == ["/World/Cloth"]
+    assert len(scene.warnings) >= 2
 
 
 def test_scene_is_plain_data():

@@ -200,7 +200,8 @@ def test_loop_in_a_stage():
     assert len(read_scene(stage).meshes[0].triangles) == 8 * 16
     stage, _ = subdivision_stage(CUBE_FACES, CUBE, "loop")
     scene = read_scene(stage)
-    assert len(scene.meshes[0].triangles) == 12 and "Loop subdivision of faces that are no triangles" in scene.warnings[0]
+    assert len(scene.meshes[0].triangles) == 12
+    assert "Loop subdivision of faces that are no triangles" in scene.warnings[0]
 
 
 def test_dense_meshes_are_not_refined():

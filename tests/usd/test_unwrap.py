@@ -8,7 +8,7 @@ from pxr import Gf, Usd, UsdGeom
 
 from usdfab.errors import UsdfabError
 from usdfab.usd.read_scene import read_scene
-from usdfab.usd.unwrap import unwrap, unwrap_faces
+from usdfab.usd.unwrap import _unfolded, unwrap, unwrap_faces
 
 
 def sheet(n, height):
@@ -47,7 +47,7 @@ def test_folds_keep_lengths(scale):
     points, triangles = scale * points, triangles_of(quads)
     uv = unwrap(points, triangles)
     found = stretch(points, triangles, uv)
-    assert 0.75 < found.min() and found.max() < 1.25
+    assert found.min() > 0.75 and found.max() < 1.25
     assert np.abs(found - 1).mean() < 0.05
     edges = uv[:, 1:] - uv[:, :1]
     area = 0.5 * np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]).sum()
@@ -60,7 +60,7 @@ def test_faces_stay_whole():
     points, quads = sheet(12, 0.3)
     uv = unwrap_faces(points, np.full(len(quads), 4), quads.ravel()).reshape(-1, 4, 2)
     sides = np.linalg.norm(points[quads] - np.roll(points[quads], 1, axis=1), axis=2)
-    np.testing.assert_allclose(np.linalg.norm(uv - np.roll(uv, 1, axis=1), axis=2), sides, rtol=0.35)
+    np.testing.assert_allclose(np.linalg.norm(uv - np.roll(uv, 1, axis=1), axis=2), sides, rtol=0.3)
 
 
 def test_slivers_and_dust():
@@ -105,7 +105,7 @@ def test_only_cloth_is_unwrapped(cloth_stage, new_mesh):
     assert scene.warnings == () and scene.meshes[1].uv is None
 
 
-def test_unwrapped_subdivision_cage(cloth_stage, fabric):
+def test_unwrapped_subdivision_cage(fabric):
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     points, quads = sheet(8, 0.05)
@@ -116,7 +116,7 @@ def test_unwrapped_subdivision_cage(cloth_stage, fabric):
     scene = read_scene(stage, fabric_override=fabric)
     assert len(scene.meshes[0].triangles) == len(quads) * 32
     found = yarn_scale(scene)
-    assert np.abs(found - 1).mean() < 0.06 and 0.7 < found.min() and found.max() < 1.4
+    assert np.abs(found - 1).mean() < 0.06 and found.min() > 0.7 and found.max() < 1.4
 
 
 def test_moving_cloth_keeps_its_charts(cloth_stage):
@@ -132,3 +132,14 @@ def test_moving_cloth_keeps_its_charts(cloth_stage):
     assert np.abs(one.meshes[0].points - two.meshes[0].points).max() > 0.1
     np.testing.assert_allclose(one.meshes[0].uv, two.meshes[0].uv, atol=1e-6)
     assert one.fabrics[0].meters_per_uv == pytest.approx(two.fabrics[0].meters_per_uv)
+
+
+def test_a_bent_face_is_unfolded():
+    # two triangles at a right angle about the diagonal: flat, they are a square again
+    half = np.sqrt(0.5)
+    triangle = np.array([[(0, 0, 0), (1, 0, 0), (0, 1, 0)]], dtype=float)
+    point = np.array([(0.5, 0.5, half)])
+    np.testing.assert_allclose(_unfolded(triangle, point), [[-1, 1, 1]], atol=1e-12)
+    # its own corners stay
+    for k in range(3):
+        np.testing.assert_allclose(_unfolded(triangle, triangle[:, k]), np.eye(3)[[k]], atol=1e-12)

@@ -109,11 +109,13 @@ class Collector:
                 continue
             if above and (light or camera):
                 self.problems.warn(f"{prim.GetPath()}: lights and cameras are not copied by point instancers, left out")
-            placed = Placed(
-                prim, base @ self._to(prim, root, self.open),
-                None if base_close is None or self.close is None else base_close @ self._to(prim, root, self.close),
-                bool(above),
-            )  # fmt: skip
+            # Transforms that are not finite are found where the prim is read.
+            with np.errstate(invalid="ignore", over="ignore"):
+                opened = base @ self._to(prim, root, self.open)
+                closed = None
+                if base_close is not None and self.close is not None:
+                    closed = base_close @ self._to(prim, root, self.close)
+            placed = Placed(prim, opened, closed, bool(above))
             if light and not above:
                 self.lights.append(placed)
             if camera and not above:

@@ -36,7 +36,10 @@ class Problems:
 
     @contextmanager
     def tolerating(self, place: str, instead: str) -> Iterator[None]:
-        """A block whose errors, USD's own included, are faults. ``place`` is named where USD names none."""
+        """A block whose errors are faults: ours, USD's own, and those of Python for values of the wrong type.
+
+        ``place`` is named where the error names none.
+        """
         try:
             yield
         except UsdfabError as error:
@@ -45,3 +48,6 @@ class Problems:
             lines = str(error).strip().splitlines()
             reason = lines[-1].strip() if lines else "unreadable"
             self.fault(UsdfabError(f"USD cannot read it ({reason})", place=place), instead)
+        except (TypeError, ValueError, OverflowError) as error:
+            # USD hands out what a file holds, also where it is not of the schema's type: text for a number.
+            self.fault(UsdfabError(f"a value is not what it should be ({error})", place=place), instead)

@@ -118,7 +118,9 @@ def _shutter(
         if not prim.IsA(UsdGeom.Camera) or camera not in (None, str(prim.GetPath())):
             continue
         if is_perspective(prim, frame):
-            opening, closing = shutter_of(prim, frame)
+            opening, closing = 0.0, 0.0
+            with problems.tolerating(str(prim.GetPath()), "nothing is blurred"):
+                opening, closing = shutter_of(prim, frame)
             if closing < opening:
                 problems.warn(f"{prim.GetPath()}: the shutter closes before it opens, nothing is blurred")
             return shutter_at(frame, opening, closing)

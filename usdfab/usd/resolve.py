@@ -88,10 +88,11 @@ class Resolver:
         """Copies gathered by what they are copies of, and by what materials and colours they have."""
         shapes: dict[object, _Shape] = {}
         for place in placed:
-            bindings = read_bindings(place.prim, self.shutter.frame, self.problems)
-            looks = tuple(canonical(m) if m else None for m in bindings.materials)
-            key = (canonical(place.prim), looks, self._inherited(place.prim))
-            shapes.setdefault(key, _Shape(place.prim, bindings)).places.append(place)
+            with self.problems.tolerating(str(place.prim.GetPath()), "the mesh is left out"):
+                bindings = read_bindings(place.prim, self.shutter.frame, self.problems)
+                looks = tuple(canonical(m) if m else None for m in bindings.materials)
+                key = (place.source, looks, self._inherited(place.prim))
+                shapes.setdefault(key, _Shape(place.prim, bindings)).places.append(place)
         return list(shapes.values())
 
     def _inherited(self, prim: Usd.Prim) -> tuple[bytes, ...]:
@@ -195,7 +196,8 @@ class Resolver:
         # As large as the first copy, but not turned as it is: the charts of a mesh that moves stay what they are.
         stretch = _stretch(first.to_world[0])
         uv = unwrap_faces(cage.rest @ stretch, cage.topology.counts, cage.topology.indices)
-        return tessellate(replace(cage, uv=Values("unwrapped", uv, "faceVarying")), level)
+        # Linear when refined: charts have jagged borders, which splines would fold over.
+        return tessellate(replace(cage, uv=Values("unwrapped", uv, "faceVarying"), seams="all"), level)
 
     def _is_cloth(self, prim: Usd.Prim | None, override: FabricParameters | None) -> bool:
         return prim is not None and is_fabric(prim) and (override is not None or self._fabric(prim) is not None)

@@ -68,8 +68,8 @@ def unwrap(points: Array, triangles: Ints) -> Array:
 def unwrap_faces(points: Array, counts: Ints, indices: Ints) -> Array:
     """(C, 2) texture coordinates in metres for the corners of polygons, as ``unwrap`` gives them for their triangles.
 
-    A bent polygon whose triangles come to lie apart is put where its largest triangle is, its other corners by the map
-    of that triangle.
+    A bent polygon whose triangles come to lie apart is put where its largest triangle is, its other corners unfolded
+    about the edges of that triangle.
     """
     corners, owner = triangulate(counts, indices, points)
     uv = unwrap(points, indices[corners])
@@ -86,12 +86,31 @@ def unwrap_faces(points: Array, counts: Ints, indices: Ints) -> Array:
     apart = np.abs(at_corner[corners] - uv).max(axis=(1, 2)) > 1e-9 * max(float(np.abs(uv).max()), 1e-300)
     torn = np.isin(faces, owner[apart])
     main = leader[faces[torn]]
-    e1, e2 = p[main, 1] - p[main, 0], p[main, 2] - p[main, 0]
-    d = points[indices[torn]] - p[main, 0]
-    a, b, c = (np.einsum("ij,ij->i", x, y) for x, y in ((e1, e1), (e1, e2), (e2, e2)))
-    x, y = np.einsum("ij,ij->i", d, e1), np.einsum("ij,ij->i", d, e2)
+    weights = _unfolded(p[main], points[indices[torn]])
+    at_corner[torn] = np.einsum("nk,nkc->nc", weights, uv[main])
+    return at_corner
+
+
+def _unfolded(triangle: Array, point: Array) -> Array:
+    """(N, 3) barycentric coordinates of points turned into the planes of triangles (N, 3, 3) about the nearest edge."""
+    e1, e2, d = triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0], point - triangle[:, 0]
+    a, b, c, x, y = (np.einsum("ij,ij->i", v, w) for v, w in ((e1, e1), (e1, e2), (e2, e2), (d, e1), (d, e2)))
     determinant = np.maximum(a * c - b * b, 1e-300)
     s, t = (c * x - b * y) / determinant, (a * y - b * x) / determinant
-    base = uv[main, 0]
-    at_corner[torn] = base + s[:, None] * (uv[main, 1] - base) + t[:, None] * (uv[main, 2] - base)
-    return at_corner
+    weights = np.stack([1.0 - s - t, s, t], axis=1)
+    # The edge that the point lies beyond, across from the corner with the least weight: the distance from it counts.
+    row, corner = np.arange(len(point)), weights.argmin(axis=1)
+    start, end = triangle[row, (corner + 1) % 3], triangle[row, (corner + 2) % 3]
+    edge = (end - start) / np.maximum(np.linalg.norm(end - start, axis=1, keepdims=True), 1e-300)
+    away, height = (v - start - np.einsum("ij,ij->i", v - start, edge)[:, None] * edge
+                    for v in (point, triangle[row, corner]))  # fmt: skip
+    wanted = -np.linalg.norm(away, axis=1) / np.maximum(np.linalg.norm(height, axis=1), 1e-300)
+    change = wanted - weights[row, corner]
+    # Along the edge the point stays where it is: the height's own foot moves with its weight.
+    along = np.einsum("ij,ij->i", triangle[row, corner] - start, edge) / np.maximum(
+        np.linalg.norm(end - start, axis=1), 1e-300
+    )
+    weights[row, corner] = wanted
+    weights[row, (corner + 2) % 3] -= change * along
+    weights[row, (corner + 1) % 3] -= change * (1.0 - along)
+    return weights
