@@ -36,7 +36,7 @@ def test_bad(path):
     rule = USD_RULES.get(path.stem, f"usdfab:{path.stem.split('_')[0]}")
     assert {i.rule for i in issues} == {rule}, issues
     assert all(str(path) in i.site for i in issues)
-    assert {i.severity for i in issues} == {"warning" if path.stem in ("authored", "widths_varying") else "error"}
+    assert {i.severity for i in issues} == {"warning" if path.stem in ("authored", "uv", "widths_varying") else "error"}
 
 
 def test_issues_name_the_attribute_and_read_well():

@@ -290,11 +290,11 @@ def test_what_cannot_be_hidden_is_said(cloth, tmp_path):
     grey = UsdShade.Material.Define(stage, "/World/Looks/Grey")
     subset = UsdGeom.Subset.CreateGeomSubset(mesh, "part", "face", [0], "materialBind")
     UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(grey)
-    UsdLux.DiskLight.Define(stage, "/World/Disk")
+    UsdLux.GeometryLight.Define(stage, "/World/Lamp")
     stage.Save()
     result = expand(cloth, tmp_path / "f.usda", vertices_per_segment=6)
     text = "\n".join(result.warnings)
-    assert "only some faces are cloth" in text and "DiskLight" in text
+    assert "only some faces are cloth" in text and "GeometryLight" in text
     assert 0 < result.instances < 200
 
 

@@ -10,7 +10,16 @@ from pxr import Gf, Usd, UsdGeom, UsdLux
 
 from usdfab.errors import UsdfabError
 from usdfab.usd.read_lights import matrix, read_light
-from usdfab.usd.scene import DistantLight, DomeLight, PointLight, RectLight, SphereLight
+from usdfab.usd.read_scene import read_scene
+from usdfab.usd.scene import (
+    CylinderLight,
+    DiskLight,
+    DistantLight,
+    DomeLight,
+    PointLight,
+    RectLight,
+    SphereLight,
+)
 
 
 def stage_with(kind: str, up: str = "Z", **inputs):
@@ -177,7 +186,7 @@ def test_dome_texture_path_is_resolved(tmp_path):
     assert read(stage)[0].texture_path == str(tmp_path / "sky.exr")
 
 
-@pytest.mark.parametrize("kind", ["DiskLight", "CylinderLight", "PortalLight", "GeometryLight"])
+@pytest.mark.parametrize("kind", ["PortalLight", "GeometryLight"])
 def test_unsupported_lights_are_named(kind):
     light, warnings = read(stage_with(kind)[0])
     assert light is None
@@ -206,3 +215,94 @@ def test_bad_values(kind, inputs, problem):
     stage, _ = stage_with(kind, **inputs)
     with pytest.raises(UsdfabError, match=problem):
         read(stage)
+
+
+def test_disk():
+    disk = light_of("DiskLight", radius=2.0, intensity=8 * math.pi, normalize=True)
+    assert isinstance(disk, DiskLight)
+    np.testing.assert_allclose([disk.center, disk.axis_u, disk.axis_v], [[0, 0, 0], [2, 0, 0], [0, 2, 0]])
+    np.testing.assert_allclose(disk.normal, [0, 0, -1])
+    # L = X / (pi r^2)
+    np.testing.assert_allclose(disk.radiance, 2, rtol=1e-6)
+    np.testing.assert_allclose(light_of("DiskLight", radius=2.0, intensity=3.0).radiance, 3)
+
+
+def test_disks_become_ellipses_and_stay_the_right_way_round():
+    stage, light = stage_with("DiskLight", radius=1.0, intensity=6 * math.pi, normalize=True)
+    light.AddTranslateOp().Set(Gf.Vec3d(0, 0, 10))
+    light.AddScaleOp().Set(Gf.Vec3f(-2, 3, 1))
+    disk, warnings = read(stage, 0.01)
+    assert warnings == []
+    np.testing.assert_allclose([disk.center, disk.axis_u, disk.axis_v], [[0, 0, 0.1], [-0.02, 0, 0], [0, 0.03, 0]])
+    np.testing.assert_allclose(disk.normal, [0, 0, -1])
+    # the area in stage units is 6 pi
+    np.testing.assert_allclose(disk.radiance, 1, rtol=1e-6)
+
+
+def test_cylinder():
+    stage, light = stage_with("CylinderLight", radius=0.5, length=4.0, intensity=12 * math.pi, normalize=True)
+    light.AddTranslateOp().Set(Gf.Vec3d(1, 2, 3))
+    light.AddScaleOp().Set(Gf.Vec3f(0.5, 3, 3))
+    cylinder, warnings = read(stage, 0.1)
+    assert isinstance(cylinder, CylinderLight) and warnings == []
+    np.testing.assert_allclose(cylinder.center, [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(cylinder.half, [0.1, 0, 0])
+    assert cylinder.radius == pytest.approx(0.15)
+    # 2 pi r l = 2 pi 1.5 2 in stage units
+    np.testing.assert_allclose(cylinder.radiance, 2, rtol=1e-6)
+    np.testing.assert_allclose(light_of("CylinderLight", intensity=5.0).radiance, 5)
+
+
+def test_flattened_cylinders_are_reported():
+    stage, light = stage_with("CylinderLight", radius=1.0)
+    light.AddScaleOp().Set(Gf.Vec3f(1, 4, 1))
+    cylinder, warnings = read(stage)
+    assert cylinder.radius == pytest.approx(2.0) and "elliptic" in warnings[0]
+
+
+def test_lines():
+    # a line's intensity per length is that of any thin cylinder of the same power
+    line = light_of("CylinderLight", radius=0.0, length=2.0, intensity=3.0, normalize=True, treatAsLine=True)
+    thin = light_of("CylinderLight", radius=1e-3, length=2.0, intensity=3.0, normalize=True)
+    np.testing.assert_allclose(line.radiance * line.radius, thin.radiance * thin.radius, rtol=1e-6)
+    assert 0 < line.radius < 0.01
+
+
+NO_AREA = {
+    "DiskLight": {"radius": 0.0},
+    "CylinderLight": {"length": 0.0},
+    "SphereLight": {"radius": 0.0},
+    "RectLight": {"height": 0.0},
+}
+
+
+@pytest.mark.parametrize("kind", NO_AREA)
+@pytest.mark.parametrize("how", ["size", "scale"])
+def test_lights_without_area_are_left_out(kind, how, new_mesh):
+    stage, light = stage_with(kind, **(NO_AREA[kind] if how == "size" else {}))
+    if how == "scale":
+        light.AddScaleOp().Set(Gf.Vec3f(1, 0, 0))
+    new_mesh(stage, "/M", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [[0, 1, 2]])
+    scene = read_scene(stage)
+    assert scene.lights == ()
+    assert "</L" in scene.warnings[0] and scene.warnings[0].endswith("; the light is left out")
+    with pytest.raises(UsdfabError, match="</L"):
+        read_scene(stage, strict=True)
+
+
+@pytest.mark.parametrize("kind", [*NO_AREA, "DistantLight", "DomeLight"])
+def test_lights_at_no_place(kind, new_mesh):
+    stage, light = stage_with(kind)
+    light.AddTranslateOp().Set(Gf.Vec3d(math.nan, 0, 0))
+    new_mesh(stage, "/M", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [[0, 1, 2]])
+    scene = read_scene(stage)
+    assert scene.lights == () and "</L>: the transform is not finite; the light is left out" in scene.warnings[0]
+
+
+def test_domes_whose_image_is_missing(new_mesh):
+    stage, _ = stage_with("DomeLight", **{"texture:file": "/nowhere/sky.exr"})
+    new_mesh(stage, "/M", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [[0, 1, 2]])
+    scene = read_scene(stage)
+    assert scene.lights == ()
+    problem = "the image /nowhere/sky.exr does not exist"
+    assert scene.warnings == (f"/L.inputs:texture:file: {problem}; the light is left out",)

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings, strategies as st
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, Vt
 
 from usdfab.errors import UsdfabError
@@ -155,7 +156,7 @@ def test_subdivision_cages_get_smooth_normals(new_mesh):
     mesh = new_mesh(stage, "/M", roof, [[0, 1, 2, 3], [1, 4, 5, 2]])
     assert read_scene(stage).meshes[0].normals is None
     mesh.GetSubdivisionSchemeAttr().Set("catmullClark")
-    read = read_scene(stage).meshes[0]
+    read = read_scene(stage, subdivision=0).meshes[0]
     ridge = np.isin(read.triangles, [1, 2])
     lengths = np.linalg.norm(read.normals, axis=2)
     np.testing.assert_allclose(lengths, 1)
@@ -174,7 +175,10 @@ def test_indexed_face_varying_uv_under_another_name(new_mesh):
     np.testing.assert_allclose(read_scene(stage).meshes[0].uv[1], [(0, 0), (1, 1), (0, 0)])
     uv.SetIndices(Vt.IntArray([0, 1, 2, 7]))
     with pytest.raises(UsdfabError, match=r"unwrap:indices>: an index is out of range"):
-        read_scene(stage)
+        read_scene(stage, strict=True)
+    scene = read_scene(stage)
+    assert scene.meshes[0].uv is None
+    assert "/M.primvars:unwrap:indices>: an index is out of range" in scene.warnings[0]
 
 
 def test_holes_and_slivers_are_left_out(new_mesh):
@@ -219,6 +223,8 @@ def test_visibility_purpose_activation(new_mesh):
     scene = read_scene(stage)
     assert {m.path for m in scene.meshes} == {"/Seen", "/Render"}
     assert scene.lights == ()
+    scene = read_scene(stage, purposes=("default", "proxy"))
+    assert {m.path for m in scene.meshes} == {"/Seen", "/Proxy"}
 
 
 def test_instances(new_mesh):
@@ -243,12 +249,12 @@ def test_what_is_left_out_is_named(new_mesh):
     UsdGeom.PointInstancer.Define(stage, "/P")
     new_mesh(stage, "/P/Prototype", SQUARE, [[0, 1, 2, 3]])
     new_mesh(stage, "/Empty", [], [])
-    UsdLux.DiskLight.Define(stage, "/Disk")
+    UsdLux.GeometryLight.Define(stage, "/Lamp")
     UsdGeom.Camera.Define(stage, "/Ortho").CreateProjectionAttr("orthographic")
-    scene = read_scene(stage)
+    scene = read_scene(stage, placements=False)
     assert len(scene.meshes) == 1 and scene.lights == () and scene.cameras == ()
     text = "\n".join(scene.warnings)
-    for part in ("2 prims of type Sphere", "1 prims of type PointInstancer", "/Empty", "DiskLight", "/Ortho"):
+    for part in ("2 prims of type Sphere", "1 prims of type PointInstancer", "/Empty", "GeometryLight", "/Ortho"):
         assert part in text
 
 
@@ -278,7 +284,12 @@ def test_camera_values(cloth_stage):
     np.testing.assert_allclose(read.to_world[:3, :3], np.eye(3), atol=1e-12)
     camera.GetFocalLengthAttr().Set(0.0)
     with pytest.raises(UsdfabError, match="/World/Camera>: focal length"):
-        read_scene(cloth_stage)
+        read_scene(cloth_stage, strict=True)
+    scene = read_scene(cloth_stage)
+    assert scene.cameras == () and "the camera is left out" in scene.warnings[0]
+    # nothing can stand in for a camera that was asked for
+    with pytest.raises(UsdfabError, match="/World/Camera>: focal length"):
+        read_scene(cloth_stage, camera="/World/Camera")
 
 
 def test_the_chosen_camera_comes_first(cloth_stage):
@@ -327,7 +338,7 @@ def test_preview_surface(new_mesh):
     shader.GetInput("diffuseColor").ConnectToSource(texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
     scene = read_scene(stage)
     np.testing.assert_allclose(scene.materials[0].base_color, [0, 0.5, 0])
-    assert "diffuseColor comes from /P/T" in scene.warnings[0]
+    assert "diffuseColor comes from /P/T, which names no image" in scene.warnings[0]
 
 
 def test_display_color_else_grey(new_mesh):
@@ -355,7 +366,11 @@ def test_subsets(new_mesh, cloth_stage):
     assert looks[1].fabric == 1
     subset.GetIndicesAttr().Set(Vt.IntArray([5]))
     with pytest.raises(UsdfabError, match=r"part.indices>: a face index is out of range"):
-        read_scene(cloth_stage)
+        read_scene(cloth_stage, strict=True)
+    scene = read_scene(cloth_stage)
+    two = next(m for m in scene.meshes if m.path == "/World/Two")
+    assert [scene.materials[i].path for i in two.face_material] == ["/World/Looks/Red"] * 2
+    assert "part.indices>: a face index is out of range" in scene.warnings[0]
 
 
 # --- fabrics ---------------------------------------------------------------------------------------------------------
@@ -407,8 +422,11 @@ def test_override_without_bound_fabric(new_mesh, fabric):
     bind(other, preview(stage, "/Q", diffuseColor=Gf.Vec3f(1, 0, 0))[0])
     with pytest.raises(UsdfabError, match=r"which mesh is cloth\? .*\(/Taken, /Other\).*usdfab bind"):
         read_scene(stage, fabric_override=fabric)
-    for path in ("/Taken", "/Other"):
-        stage.RemovePrim(path)
+    stage.RemovePrim("/Taken")
+    stage.RemovePrim("/Other")
+    # the only mesh is the cloth also without texture coordinates
+    assert len(read_scene(stage, fabric_override=fabric).fabrics) == 1
+    new_mesh(stage, "/Plain2", SQUARE, [[0, 1, 2, 3]])
     with pytest.raises(UsdfabError, match="no mesh has texture coordinates"):
         read_scene(stage, fabric_override=fabric)
 
@@ -416,7 +434,11 @@ def test_override_without_bound_fabric(new_mesh, fabric):
 def test_bad_fabric_values_are_located(cloth_stage):
     cloth_stage.GetPrimAtPath("/World/Looks/Fabric").GetAttribute("usdfab:yarn:warp:ior").Set(0.5)
     with pytest.raises(UsdfabError, match=r"</World/Looks/Fabric.usdfab:yarn:warp:ior>: 0.5 is not between 1.01 and 3"):
-        read_scene(cloth_stage)
+        read_scene(cloth_stage, strict=True)
+    # without strict, the cloth has its preview surface
+    scene = read_scene(cloth_stage)
+    assert scene.fabrics == () and scene.materials[0].path == "/World/Looks/Fabric"
+    assert "warp:ior>: 0.5 is not between 1.01 and 3; the cloth is shown without fibers" in scene.warnings[0]
 
 
 # --- bad stages ------------------------------------------------------------------------------------------------------
@@ -431,19 +453,8 @@ def test_stages_without_meshes(tmp_path, fabric):
         read_scene(tmp_path / "none.usda")
 
 
-def test_fabric_without_uv(cloth_stage):
-    mesh = cloth_stage.GetPrimAtPath("/World/Cloth")
-    st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
-    st.Set([Gf.Vec2f(0.5, 0.5)] * 4)
-    with pytest.raises(UsdfabError, match="</World/Cloth>: the texture coordinates of the cloth cover no area"):
-        read_scene(cloth_stage)
-    UsdGeom.PrimvarsAPI(mesh).RemovePrimvar("st")
-    with pytest.raises(UsdfabError, match="</World/Cloth>: the mesh carries a fabric but has no texture"):
-        read_scene(cloth_stage)
-
-
 BAD_MESHES = {
-    "points": ([Gf.Vec3f(0, 0, math.nan)] * 4, "point 0 is not finite"),
+    "points": (Vt.Vec3fArray([Gf.Vec3f(0, 0, math.nan)] * 4), "point 0 is not finite"),
     "faceVertexIndices": (Vt.IntArray([0, 1, 2, 4]), "index 4 is out of range, there are 4 points"),
     "faceVertexCounts": (Vt.IntArray([5]), "ask for 5 indices, there are 4"),
     "primvars:st": ([Gf.Vec2f(0, 0)] * 3, "3 values for vertex interpolation, expected 4"),
@@ -451,12 +462,20 @@ BAD_MESHES = {
 
 
 @pytest.mark.parametrize("name", BAD_MESHES)
-def test_bad_meshes(cloth_stage, name):
+def test_bad_meshes(cloth_stage, new_mesh, name):
     value, problem = BAD_MESHES[name]
     cloth_stage.GetPrimAtPath("/World/Cloth").GetAttribute(name).Set(value)
     with pytest.raises(UsdfabError, match=problem) as caught:
-        read_scene(cloth_stage)
+        read_scene(cloth_stage, strict=True)
     assert caught.value.place.endswith(f"</World/Cloth.{name}>")
+    if name != "primvars:st":
+        with pytest.raises(UsdfabError, match=f"no mesh can be drawn: .*{problem}"):
+            read_scene(cloth_stage)
+    new_mesh(cloth_stage, "/World/Floor", SQUARE, [[0, 1, 2, 3]])
+    scene = read_scene(cloth_stage)
+    expected = ["/World/Cloth", "/World/Floor"] if name == "primvars:st" else ["/World/Floor"]
+    assert [m.path for m in scene.meshes] == expected
+    assert f"</World/Cloth.{name}>: " in scene.warnings[0] and problem in scene.warnings[0]
 
 
 def test_singular_transforms_leave_the_mesh_out(cloth_stage, new_mesh):
@@ -464,7 +483,109 @@ def test_singular_transforms_leave_the_mesh_out(cloth_stage, new_mesh):
     UsdGeom.Xformable(flat).AddScaleOp().Set(Gf.Vec3f(1, 0, 1))
     scene = read_scene(cloth_stage)
     assert [m.path for m in scene.meshes] == ["/World/Cloth"]
-    assert "/World/Flat: the transform is singular" in scene.warnings[0]
+    assert "/World/Flat>: the transform is singular; the mesh is left out" in scene.warnings[0]
+    with pytest.raises(UsdfabError, match="/World/Flat>: the transform is singular"):
+        read_scene(cloth_stage, strict=True)
+
+
+def test_degenerate_meshes_and_transforms_without_numbers(cloth_stage, new_mesh):
+    new_mesh(cloth_stage, "/World/Line", [(0, 0, 0), (1, 0, 0), (2, 0, 0)], [[0, 1, 2]])
+    lost = new_mesh(cloth_stage, "/World/Lost", SQUARE, [[0, 1, 2, 3]])
+    UsdGeom.Xformable(lost).AddTranslateOp().Set(Gf.Vec3d(math.nan, 0, 0))
+    scene = read_scene(cloth_stage)
+    assert [m.path for m in scene.meshes] == ["/World/Cloth"]
+    text = "\n".join(scene.warnings)
+    assert "/World/Line>: the mesh has no area; the mesh is left out" in text
+    assert "/World/Lost>: the transform is not finite; the mesh is left out" in text
+    for path, problem in (("/World/Line", "no area"), ("/World/Lost", "not finite")):
+        cloth_stage.GetPrimAtPath("/World/Line").SetActive(path == "/World/Line")
+        with pytest.raises(UsdfabError, match=f"{path}>: .*{problem}"):
+            read_scene(cloth_stage, strict=True)
+
+
+NUMBERS = st.sampled_from([0.0, 1.0, -1.0, 0.5, 3.0, 1e30, math.nan, math.inf])
+INDICES = st.lists(st.integers(-2, 9), max_size=12)
+
+
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    points=st.lists(st.tuples(NUMBERS, NUMBERS, NUMBERS), max_size=8),
+    counts=st.lists(st.integers(-1, 5), max_size=4),
+    indices=INDICES,
+    uv=st.lists(st.tuples(NUMBERS, NUMBERS), max_size=8),
+    holes=INDICES,
+    interpolation=st.sampled_from(["vertex", "faceVarying", "constant", "uniform", "nonsense"]),
+    scheme=st.sampled_from(["none", "catmullClark", "loop", "bilinear"]),
+    scale=st.tuples(NUMBERS, NUMBERS, NUMBERS),
+    bound=st.booleans(),
+)
+def test_nonsense_never_crashes(
+    cloth_stage, new_mesh, points, counts, indices, uv, holes, interpolation, scheme, scale, bound
+):
+    cloth_stage.RemovePrim("/World/Bad")
+    mesh = UsdGeom.Mesh.Define(cloth_stage, "/World/Bad")
+    mesh.CreatePointsAttr([Gf.Vec3f(*p) for p in points])
+    mesh.CreateFaceVertexCountsAttr(counts)
+    mesh.CreateFaceVertexIndicesAttr(indices)
+    mesh.CreateHoleIndicesAttr(holes)
+    mesh.CreateCreaseIndicesAttr(indices)
+    mesh.CreateCreaseLengthsAttr([2])
+    mesh.CreateCreaseSharpnessesAttr([3.0])
+    mesh.CreateSubdivisionSchemeAttr(scheme)
+    UsdGeom.Xformable(mesh).AddScaleOp().Set(Gf.Vec3f(*scale))
+    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray)
+    primvar.GetAttr().SetMetadata("interpolation", interpolation)
+    primvar.Set([Gf.Vec2f(*c) for c in uv])
+    if bound:
+        bind(mesh, UsdShade.Material(cloth_stage.GetPrimAtPath("/World/Looks/Fabric")))
+    scene = read_scene(cloth_stage)
+    assert scene.meshes[0].path == "/World/Cloth"
+    for found in scene.meshes:
+        assert np.isfinite(found.points).all()
+        assert found.triangles.max() < len(found.points)
+    # what is drawn without a word when tolerant is no error when strict, and the other way round
+    try:
+        strict = read_scene(cloth_stage, strict=True)
+    except UsdfabError as error:
+        assert scene.warnings and error.problem in " ".join(scene.warnings)
+    else:
+        assert len(strict.meshes) == len(scene.meshes)
+
+
+def test_attributes_of_another_type(cloth_stage):
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.ImportFromString(
+        """#usda 1.0
+        over "World" {
+            def Mesh "Bad" {
+                string[] points = ["a"]
+                int[] faceVertexCounts = [3]
+                float[] faceVertexIndices = [0.5, 1, 2]
+                string primvars:st = "uv"
+                bool doubleSided = 1
+            }
+            def Mesh "Worse"
+            {
+                string subdivisionScheme = "none"
+                double3 points = (1, 2, 3)
+                int[] faceVertexCounts = [3]
+                int[] faceVertexIndices = [0, 0, 0]
+            }
+            def Camera "Odd"
+            {
+                string focalLength = "long"
+            }
+            def SphereLight "Lamp"
+            {
+                string inputs:radius = "big"
+                asset inputs:intensity = @x@
+            }
+        }"""
+    )
+    cloth_stage.GetRootLayer().subLayerPaths.append(layer.identifier)
+    scene = read_scene(cloth_stage)
+    assert [m.path for m in scene.meshes] == ["/World/Cloth"]
+    assert len(scene.warnings) >= 2
 
 
 def test_scene_is_plain_data():

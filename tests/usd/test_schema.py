@@ -67,6 +67,8 @@ def material() -> Usd.Prim:
 def as_plain(value):
     if isinstance(value, (str, int, float)):
         return value
+    if isinstance(value, Sdf.AssetPath):
+        return value.path
     return [as_plain(v) for v in value]
 
 
@@ -78,6 +80,7 @@ def names_and_attributes():
 
 OTHER = {
     "int": 7,
+    "asset": Sdf.AssetPath("./maps/indigo.png"),
     "double": 0.1 + 0.2,
     "string": "Leinwand »fein«",
     "int2": Gf.Vec2i(3, 5),

@@ -110,6 +110,9 @@ class FabricParameters:
         Fixes every random draw of the fibers.
     variants:
         How many variants of the repeating tile a renderer mixes, so that the eye finds no repetition; 1 is off.
+    albedo_map:
+        Path of an image that multiplies the fiber albedo, looked up with the texture coordinates of the cloth; empty
+        for none.
     """
 
     weave: Weave = field(default_factory=plain)
@@ -120,6 +123,7 @@ class FabricParameters:
     name: str = "Fabric"
     provenance: Provenance = field(default_factory=Provenance)
     variants: int = 4
+    albedo_map: str = ""
 
     def __post_init__(self) -> None:
         if len(self.size) != 2:
@@ -218,7 +222,8 @@ def _check_range(parameter: Parameter, number: float, place: str) -> None:
 def edited(fabric: FabricParameters, settings: Mapping[str, str]) -> FabricParameters:
     """``fabric`` with settings such as ``{"warp.albedo": ".1,.2,.5", "weave": "twill 2/2"}`` applied.
 
-    Names: ``weave``, ``size`` (two lengths, in metres or with a unit), ``seed``, ``variants``, ``name``, and
+    Names: ``weave``, ``size`` (two lengths, in metres or with a unit), ``seed``, ``variants``, ``name``, ``albedo_map``
+    (a file), and
     ``warp.NAME`` or ``weft.NAME`` or ``both.NAME`` for each row of the parameter table.
 
     Raises
@@ -242,12 +247,15 @@ def _edited_once(fabric: FabricParameters, key: str, text: str) -> FabricParamet
         return replace(fabric, **{key: int(text)})  # type: ignore[arg-type]
     if key == "name":
         return replace(fabric, name=text)
+    if key == "albedo_map":
+        return replace(fabric, albedo_map=text)
     system, _, name = key.partition(".")
     if system not in ("warp", "weft", "both") or name not in PARAMETER_BY_NAME:
         known = ", ".join(p.name for p in YARN_PARAMETERS)
         raise UsdfabError(
             f"unknown parameter '{key}'",
-            remedy=f"use weave, size, seed, variants, name, or warp., weft. or both. followed by one of: {known}",
+            remedy="use weave, size, seed, variants, name, albedo_map, or warp., weft. or both. followed by one of: "
+            + known,
         )
     value = _parse_value(PARAMETER_BY_NAME[name], text, key)
     changes = {s: replace(fabric.system(s), **{name: value}) for s in SYSTEMS if system in (s, "both")}
@@ -316,6 +324,7 @@ def as_table(fabric: FabricParameters) -> dict[str, Any]:
         "size_m": list(fabric.size),
         "seed": fabric.seed,
         "variants": fabric.variants,
+        "albedo_map": fabric.albedo_map,
         "warp": yarn(fabric.warp),
         "weft": yarn(fabric.weft),
         "provenance": {

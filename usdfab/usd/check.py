@@ -14,7 +14,7 @@ from usdfab.errors import UsdfabError
 from usdfab.fabric import PARAMETER_BY_NAME
 from usdfab.fabric.fabric import checked_value
 from usdfab.usd.fabric_io import fabric_from_prim, is_fabric, meters_per_uv_from_prim
-from usdfab.usd.read_mesh import UV_NAMES
+from usdfab.usd.primvars import UV_NAMES
 from usdfab.usd.registration import FABRIC_API, YARN_API
 from usdfab.usd.schema_source import (
     FABRIC_ATTRIBUTES,
@@ -142,7 +142,7 @@ def _values(prim: Usd.Prim) -> Iterator[Issue]:
         usd_attribute = prim.GetAttribute(name)
         value = usd_attribute.Get() if usd_attribute else None
         # Files of another version hold other attributes: the defaults of those that came later do no harm.
-        expected = attribute.since <= version <= SCHEMA_VERSION
+        expected = attribute.since <= version <= SCHEMA_VERSION and attribute.type_name != "asset"
         if expected and value is not None and not usd_attribute.HasAuthoredValue():
             message = "not authored; programs that do not know usdfab's schema cannot see it"
             yield _warning(path, prim, "authored", message)
@@ -245,7 +245,7 @@ def _widths(curves: UsdGeom.BasisCurves, counts: np.ndarray, points: int, time: 
 
 
 def _cloth(prim: Usd.Prim) -> Iterator[Issue]:
-    """``usdfab:uv``: a mesh that carries a fabric needs texture coordinates."""
+    """``usdfab:uv``: a mesh that carries a fabric should say by texture coordinates where its yarns run."""
     if not prim.IsA(UsdGeom.Mesh):
         return
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
@@ -255,7 +255,8 @@ def _cloth(prim: Usd.Prim) -> Iterator[Issue]:
             p.GetTypeName().role == Sdf.ValueRoleNames.TextureCoordinate for p in api.GetPrimvarsWithValues()
         )
         if not textured and not any(api.HasPrimvar(name) for name in UV_NAMES):
-            yield _error(prim, prim, "uv", "the mesh carries a fabric but has no texture coordinates; add 'st'")
+            message = "the cloth has no texture coordinates, renderers unwrap it as they like; add 'st'"
+            yield _warning(prim, prim, "uv", message)
 
 
 RULES: tuple[Callable[[Usd.Prim], Iterator[Issue]], ...] = (_applied, _values, _preview, _curves, _cloth)

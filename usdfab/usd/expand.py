@@ -84,7 +84,7 @@ def expand(
     source_path, out_path = Path(source).resolve(), Path(out).resolve()
     if source_path == out_path:
         raise UsdfabError("the file to write is the file to read", place=str(out), remedy="choose another name")
-    scene = read_scene(source, time=time, fabric_override=fabric)
+    scene = read_scene(source, time=time, fabric_override=fabric, shutter=False, placements=False)
     surfaces = _surfaces(scene, prim)
     with atomic_path(out, overwrite=overwrite) as temporary:
         stage = _new_layer(source_path, temporary)

@@ -7,9 +7,10 @@ prim fails asset checkers). Other stages reference ``@fabric.usda@</Looks/Fabric
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -54,16 +55,32 @@ def write_fabric(
         If the file exists (unless ``overwrite``), cannot be written, or a text in the fabric cannot be stored.
     """
     checked_output(path, overwrite=overwrite)
+    fabric = replace(fabric, albedo_map=_relative(fabric.albedo_map, Path(path).parent))
     stage = new_stage()
     stage.SetDefaultPrim(UsdGeom.Scope.Define(stage, LOOKS_PATH).GetPrim())
     define_fabric_material(stage, FABRIC_PATH, fabric, meters_per_uv=meters_per_uv)
     return export_layer(stage.GetRootLayer(), path, overwrite=overwrite)
 
 
+def _relative(file: str, folder: Path) -> str:
+    """``file`` as seen from ``folder``, with forward slashes, so that both can be moved together."""
+    if not file:
+        return ""
+    try:
+        found = Path(os.path.relpath(Path(file).absolute(), folder.absolute())).as_posix()
+    except ValueError:  # on another drive
+        return Path(file).absolute().as_posix()
+    return found if found.startswith(".") else f"./{found}"
+
+
 def define_fabric_material(
     stage: Usd.Stage, path: str | Sdf.Path, fabric: FabricParameters, *, meters_per_uv: float = 0.0
 ) -> UsdShade.Material:
     """Define a Material at ``path`` that carries ``fabric``; every attribute is authored, also at its default.
+
+    The albedo map is authored only where there is one.
+
+    A relative ``albedo_map`` is authored as it is: relative to the layer.
 
     Authors both API schemas with all attributes, and ``outputs:surface`` connected to a UsdPreviewSurface called
     ``Preview`` (``preview_color``, ``preview_roughness``).
@@ -87,7 +104,9 @@ def define_fabric_material(
     prim = material.GetPrim()
     prim.ApplyAPI(FABRIC_API)
     for attribute in FABRIC_ATTRIBUTES:
-        _author(prim, fabric_attribute_name(attribute.name), attribute, values[attribute.name])
+        # An empty asset path is a broken reference to USD's validators.
+        if attribute.type_name != "asset" or values[attribute.name]:
+            _author(prim, fabric_attribute_name(attribute.name), attribute, values[attribute.name])
     for system in SYSTEMS:
         prim.ApplyAPI(YARN_API, system)
         yarn = fabric.system(system)
@@ -109,6 +128,7 @@ def _fabric_values(fabric: FabricParameters, meters_per_uv: float) -> dict[str, 
         "seed": fabric.seed,
         "variants": fabric.variants,
         "metersPerUv": meters_per_uv,
+        "albedoMap": fabric.albedo_map,
     }
 
 
@@ -128,6 +148,7 @@ _TO_USD: dict[str, Any] = {
     "int": int,
     "double": float,
     "string": str,
+    "asset": Sdf.AssetPath,
     "int2": lambda v: Gf.Vec2i(*map(int, v)),
     "double2": lambda v: Gf.Vec2d(*map(float, v)),
     "color3d": lambda v: Gf.Vec3d(*map(float, v)),
@@ -266,7 +287,7 @@ def fabric_from_prim(prim: Usd.Prim) -> FabricParameters:
     with _at(prim, {field: fabric_attribute_name(name) for field, name in places.items()}):
         return FabricParameters(
             weave, values["sampleSize"], yarns["warp"], yarns["weft"], values["seed"], values["name"],
-            Provenance(**provenance), values["variants"],
+            Provenance(**provenance), values["variants"], values["albedoMap"],
         )  # fmt: skip
 
 
@@ -302,6 +323,7 @@ _FROM_USD: dict[str, Any] = {
     "int": int,
     "double": float,
     "string": str,
+    "asset": lambda v: str(v.resolvedPath or v.path),
     "int2": lambda v: (int(v[0]), int(v[1])),
     "double2": lambda v: (float(v[0]), float(v[1])),
     "color3d": lambda v: (float(v[0]), float(v[1]), float(v[2])),
@@ -318,8 +340,11 @@ def _read(prim: Usd.Prim, name: str, attribute: SchemaAttribute) -> Any:
     if value is None:
         raise UsdfabError("the attribute is missing", place=place, remedy="write the fabric again with usdfab")
     try:
+        if attribute.type_name == "asset" and value.path and not value.resolvedPath:
+            # A missing file too is named as seen from the layer that names it.
+            return found.GetPropertyStack(Usd.TimeCode.Default())[0].layer.ComputeAbsolutePath(value.path)
         return _FROM_USD[attribute.type_name](value)
-    except (TypeError, ValueError, IndexError) as error:
+    except (AttributeError, TypeError, ValueError, IndexError) as error:
         expected = attribute.type_name
         raise UsdfabError(f"expected a value of type {expected}, got {value!r}", place=place) from error
 

@@ -7,7 +7,8 @@ and its copy in metres differ when ``normalize`` is on, as in every other render
 - Without ``normalize`` L = X, with it L = X / A. Radiance does not change with the unit of length.
 - Sphere, A = 4 pi r^2. Seen from far away it has the projected area pi r^2, so a sphere that is treated as a point has
   the intensity I = pi r^2 L with r in metres. With ``normalize`` that is X / 4 times (metres per unit)^2, whatever r.
-- Rectangle, A = |edge_u x edge_v|.
+- Rectangle, A = |edge_u x edge_v|. Disk, scaled to an ellipse with half axes u and v, A = pi |u x v|.
+- Cylinder without caps, A = 2 pi r l.
 - Distant light of half angle t: with ``normalize`` L = X / (pi sin^2 t) for t up to pi/2, (2 - sin^2 t) pi beyond, 1
   for t = 0. A surface that faces the light receives E = L * integral of cos over the cone in front of it = L pi sin^2 t
   (t up to pi/2; L pi beyond). Parallel light (t = 0) has no radiance: E = X, with ``normalize`` and without.
@@ -22,10 +23,23 @@ import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdLux
 
 from usdfab.errors import UsdfabError
-from usdfab.usd.scene import Array, DistantLight, DomeLight, Light, PointLight, RectLight, SphereLight
+from usdfab.usd.assets import image_file
+from usdfab.usd.scene import (
+    Array,
+    CylinderLight,
+    DiskLight,
+    DistantLight,
+    DomeLight,
+    Light,
+    PointLight,
+    RectLight,
+    SphereLight,
+)
 from usdfab.usd.stage import site
 
 _SCALE_TOLERANCE = 1e-4
+_LINE_RADIUS = 1e-3
+"""Radius over length of a cylinder without radius that is to be treated as a line."""
 
 
 def is_light(prim: Usd.Prim) -> bool:
@@ -58,6 +72,8 @@ def read_light(
     place, kind = str(prim.GetPath()), prim.GetTypeName()
     if kind not in _READERS:
         return None, [f"{place}: lights of type {kind or 'LightAPI on geometry'} are not supported, left out"]
+    if not np.isfinite(to_world).all():
+        raise UsdfabError("the transform is not finite", place=site(prim.GetStage(), prim))
     warnings = _ignored(prim, time)
     emission = _emission(UsdLux.LightAPI(prim), time)
     return _READERS[kind](prim, to_world, meters_per_unit, time, emission, warnings), warnings
@@ -117,8 +133,10 @@ def _sphere(
         # I = pi r^2 L, L = X or X / (4 pi r^2).
         intensity = emission * (mpu**2 / 4.0 if normalize else math.pi * (radius * mpu) ** 2)
         if radius == 0 and not normalize:
-            warnings.append(f"{prim.GetPath()}: a sphere of radius 0 without normalize emits nothing")
+            raise UsdfabError("a sphere of radius 0 without normalize emits nothing", place=site(prim.GetStage(), prim))
         return PointLight(str(prim.GetPath()), center, intensity)
+    if not radius > 0:
+        raise UsdfabError("the sphere has no area", place=site(prim.GetStage(), prim))
     radiance = emission / (4.0 * math.pi * radius**2) if normalize else emission
     return SphereLight(str(prim.GetPath()), center, radius * mpu, radiance)
 
@@ -137,7 +155,8 @@ def _rect(
     light = UsdLux.RectLight(prim)
     width = _positive(prim, light.GetWidthAttr(), time)
     height = _positive(prim, light.GetHeightAttr(), time)
-    if _asset(light.GetTextureFileAttr(), time):
+    texture = light.GetTextureFileAttr().Get(time)
+    if texture and texture.path:
         warnings.append(f"{prim.GetPath()}: textures on rectangle lights are not supported, the light is uniform")
     linear = to_world[:3, :3]
     edge_u, edge_v = linear @ [width, 0.0, 0.0], linear @ [0.0, height, 0.0]
@@ -150,6 +169,48 @@ def _rect(
     normal = -cross / area * np.sign(np.linalg.det(linear) or 1.0)
     radiance = emission / area if light.GetNormalizeAttr().Get(time) else emission
     return RectLight(str(prim.GetPath()), corner * mpu, edge_u * mpu, edge_v * mpu, normal, radiance)
+
+
+def _disk(
+    prim: Usd.Prim, to_world: Array, mpu: float, time: Usd.TimeCode, emission: Array, warnings: list[str]
+) -> Light:
+    light = UsdLux.DiskLight(prim)
+    radius = _positive(prim, light.GetRadiusAttr(), time)
+    linear = to_world[:3, :3]
+    axis_u, axis_v = radius * linear[:, 0], radius * linear[:, 1]
+    cross = np.cross(axis_u, axis_v)
+    size = float(np.linalg.norm(cross))
+    if not size > 0:
+        raise UsdfabError("the disk has no area", place=site(prim.GetStage(), prim))
+    # As for rectangles: the disk emits along its local -z.
+    normal = -cross / size * np.sign(np.linalg.det(linear) or 1.0)
+    radiance = emission / (math.pi * size) if light.GetNormalizeAttr().Get(time) else emission
+    return DiskLight(str(prim.GetPath()), to_world[:3, 3] * mpu, axis_u * mpu, axis_v * mpu, normal, radiance)
+
+
+def _cylinder(
+    prim: Usd.Prim, to_world: Array, mpu: float, time: Usd.TimeCode, emission: Array, warnings: list[str]
+) -> Light:
+    light = UsdLux.CylinderLight(prim)
+    line, normalize = bool(light.GetTreatAsLineAttr().Get(time)), bool(light.GetNormalizeAttr().Get(time))
+    length = _positive(prim, light.GetLengthAttr(), time)
+    radius = _positive(prim, light.GetRadiusAttr(), time, zero=line and normalize)
+    linear = to_world[:3, :3]
+    half = 0.5 * length * linear[:, 0]
+    axis = _unit(prim, half)
+    across = linear[:, 1:] - np.outer(axis, axis @ linear[:, 1:])
+    scales = np.linalg.svd(across, compute_uv=False)
+    if scales[0] > (1.0 + _SCALE_TOLERANCE) * scales[1]:
+        warnings.append(
+            f"{prim.GetPath()}: the cylinder is scaled to an elliptic one, a round one of its section is used"
+        )
+    length = 2.0 * float(np.linalg.norm(half))
+    # What a line emits per length does not depend on its radius once it is normalised; a thin cylinder stands for it.
+    radius = radius * math.sqrt(scales[0] * scales[1]) or _LINE_RADIUS * length
+    if scales[1] == 0:
+        raise UsdfabError("the transform is singular", place=site(prim.GetStage(), prim))
+    radiance = emission / (2.0 * math.pi * radius * length) if normalize else emission
+    return CylinderLight(str(prim.GetPath()), to_world[:3, 3] * mpu, half * mpu, radius * mpu, radiance)
 
 
 def _distant(
@@ -175,7 +236,7 @@ def _dome(
     light = UsdLux.DomeLight_1(prim) if prim.IsA(UsdLux.DomeLight_1) else UsdLux.DomeLight(prim)
     if light.GetPortalsRel().GetTargets():
         warnings.append(f"{prim.GetPath()}: portals are not supported, left out (they only guide sampling)")
-    texture = _asset(light.GetTextureFileAttr(), time)
+    texture = image_file(light.GetTextureFileAttr(), time)
     layout = light.GetTextureFormatAttr().Get(time)
     if texture and layout not in ("automatic", "latlong"):
         warnings.append(f"{prim.GetPath()}: textures of format {layout} are not supported, read as latlong")
@@ -188,11 +249,6 @@ def _dome(
             # +y -> +z and +z -> -y: the pole goes up, the image's middle to -y.
             rotation = rotation @ [[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
     return DomeLight(str(prim.GetPath()), rotation, emission, None, texture)
-
-
-def _asset(attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
-    value = attribute.Get(time)
-    return "" if value is None else str(value.resolvedPath or value.path)
 
 
 def _unit(prim: Usd.Prim, vector: Array) -> Array:
@@ -218,6 +274,8 @@ def matrix(value: Gf.Matrix4d) -> Array:
 _READERS = {
     "SphereLight": _sphere,
     "RectLight": _rect,
+    "DiskLight": _disk,
+    "CylinderLight": _cylinder,
     "DistantLight": _distant,
     "DomeLight": _dome,
     "DomeLight_1": _dome,

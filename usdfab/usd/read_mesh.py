@@ -1,109 +1,126 @@
-"""UsdGeom meshes as triangles in metres and world space, with their materials still as prims."""
+"""UsdGeom meshes as cages: polygons, primvars and material bindings as authored, in metres and in local space."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Sdf, Usd, UsdGeom, UsdShade
+from pxr import Usd, UsdGeom, UsdShade
 
 from usdfab.errors import UsdfabError
-from usdfab.usd.scene import Array, IntArray
+from usdfab.usd.frames import Shutter
+from usdfab.usd.primvars import Sizes, Values, read_albedo, read_normals, read_uv
+from usdfab.usd.problems import Problems
+from usdfab.usd.scene import Array
 from usdfab.usd.stage import site
-from usdfab.usd.triangulate import triangulate
+from usdfab.usd.subdivide import Topology, topology
 
-UV_NAMES = ("st", "uv", "UVMap", "map1", "st0", "st_0")
-"""Primvars that are taken as texture coordinates, in this order; then any of a texture coordinate type."""
-_UV_TYPES = {Sdf.ValueTypeNames.TexCoord2fArray, Sdf.ValueTypeNames.TexCoord2dArray, Sdf.ValueTypeNames.TexCoord2hArray}
+Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class RawMesh:
-    """A mesh before its materials are resolved.
+class Bindings:
+    """Material prims bound to a mesh and its subsets, None where nothing is, and (F,) which of them the faces have."""
 
-    ``points`` (V, 3) metres; ``triangles`` (T, 3); ``normals`` (T, 3, 3) or None; ``uv`` (T, 3, 2) or None;
-    ``materials``: the Material prims bound to the mesh and its subsets, None where nothing is bound; ``slot`` (T,):
-    index into ``materials``.
+    materials: list[Usd.Prim | None]
+    slot: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Cage:
+    """A mesh as authored: polygons in local space, metres.
+
+    ``points`` (V, 3); ``points_close`` at the shutter's closing, or None; ``rest`` (V, 3) the earliest sample, in which
+    the mesh is unwrapped if need be. ``number`` (F,) are the authored numbers of the faces, ``hole`` (F,) says which
+    are not drawn. ``scheme`` is the subdivision scheme, ``topology`` has its creases, ``boundary`` is
+    ``interpolateBoundary``, ``seams`` ``faceVaryingLinearInterpolation``.
     """
 
     prim: Usd.Prim
     points: Array
-    triangles: IntArray
-    normals: Array | None
-    uv: Array | None
-    materials: list[Usd.Prim | None]
-    slot: NDArray[np.int64]
+    points_close: Array | None
+    rest: Array
+    topology: Topology
+    number: Ints
+    hole: NDArray[np.bool_]
+    scheme: str
+    boundary: str
+    seams: str
+    left_handed: bool
     double_sided: bool
-
-    def areas(self) -> Array:
-        """(T,) areas of the triangles in square metres."""
-        p = self.points[self.triangles]
-        return 0.5 * np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
+    normals: Values | None
+    uv: Values | None
+    albedo: Values | None
 
 
-def read_mesh(
-    prim: Usd.Prim, to_world: Array, meters_per_unit: float, time: Usd.TimeCode
-) -> tuple[RawMesh | None, list[str]]:
-    """The mesh of ``prim``, or None where it has no faces (a warning then says so), and warnings.
+def read_cage(
+    prim: Usd.Prim,
+    meters_per_unit: float,
+    shutter: Shutter,
+    problems: Problems,
+    uv_names: tuple[str, ...] = (),
+) -> Cage | None:
+    """The mesh of ``prim``; None where it has no faces (a warning then says so).
+
+    Primvars that are wrong are faults, and left out. Points that move are at the shutter's opening and closing (from
+    ``velocities``, where the mesh has them); if the number of points or the faces change while it is open, the mesh is
+    still, and a warning says so.
 
     Parameters
     ----------
-    to_world: (4, 4)
-        Local to world in the stage's units, column vectors.
+    uv_names:
+        Primvars to take as texture coordinates before the usual ones (``usdfab.usd.primvars``).
 
     Raises
     ------
     UsdfabError
-        For points that are not finite, indices out of range, and primvars of the wrong length.
+        For points that are not finite, and counts and indices that do not fit.
     """
-    mesh, place = UsdGeom.Mesh(prim), str(prim.GetPath())
-    points, counts, indices = _topology(mesh, time)
+    mesh, place, time = UsdGeom.Mesh(prim), str(prim.GetPath()), shutter.frame
+    points, counts, indices = _polygons(mesh, time)
     if len(counts) == 0 or len(points) == 0:
-        return None, [f"{place}: the mesh has no faces, left out"]
-    linear = to_world[:3, :3]
-    determinant = float(np.linalg.det(linear))
-    if not np.isfinite(to_world).all() or determinant == 0.0:
-        return None, [f"{place}: the transform is singular, the mesh is left out"]
-    warnings = []
-    if (counts < 3).any():
-        warnings.append(f"{place}: {int((counts < 3).sum())} faces of fewer than three corners are left out")
-    holes = np.asarray(mesh.GetHoleIndicesAttr().Get(time) or [], dtype=np.int64)
-    corners, faces = triangulate(counts, indices, points)
-    if len(holes):
-        keep = ~np.isin(faces, holes)
-        corners, faces = corners[keep], faces[keep]
-    if len(corners) == 0:
-        return None, [*warnings, f"{place}: the mesh has no triangles, left out"]
-    # A left-handed mesh winds clockwise; a mirroring transform turns the winding once more.
-    left_handed = mesh.GetOrientationAttr().Get(time) == UsdGeom.Tokens.leftHanded
-    if left_handed != (determinant < 0):
-        corners = corners[:, [0, 2, 1]]
-    triangles = indices[corners].astype(np.int32)
-    world = (points @ linear.T + to_world[:3, 3]) * meters_per_unit
-    normals = _normals(mesh, time, counts, corners, faces, triangles)
-    if normals is not None:
-        normals = _unit(normals @ np.linalg.inv(linear), world[triangles])
-    elif mesh.GetSubdivisionSchemeAttr().Get(time) != UsdGeom.Tokens.none:
-        normals = smooth_normals(world, triangles)
-    uv = _uv(mesh, time, len(points), corners, triangles)
-    materials, face_slot = _materials(prim, len(counts), time)
-    double_sided = bool(mesh.GetDoubleSidedAttr().Get(time))
-    return RawMesh(prim, world, triangles, normals, uv, materials, face_slot[faces], double_sided), warnings
+        problems.warn(f"{place}: the mesh has no faces, left out")
+        return None
+    sizes = Sizes(len(points), len(counts), len(indices))
+    found: dict[str, Values | None] = {"normals": None, "uv": None, "albedo": None}
+    for name, instead in (("normals", "no normals"), ("uv", "no texture coordinates"), ("albedo", "no albedo")):
+        with problems.tolerating(place, f"the mesh is taken to have {instead}"):
+            if name == "normals":
+                found[name] = read_normals(mesh, time, sizes)
+            elif name == "uv":
+                found[name] = read_uv(mesh, time, sizes, uv_names)
+            else:
+                found[name] = read_albedo(mesh, time, sizes)
+    opened, closed = _moving_points(mesh, points, shutter, problems)
+    holes = _indices(mesh.GetHoleIndicesAttr(), time)
+    number = np.flatnonzero(counts >= 3)
+    if len(number) < len(counts):
+        problems.warn(f"{place}: {len(counts) - len(number)} faces of fewer than three corners are left out")
+        keep_face = counts >= 3
+        keep_corner = np.repeat(keep_face, counts)
+        counts, indices = counts[keep_face], indices[keep_corner]
+        found = {name: _kept(values, keep_face, keep_corner) for name, values in found.items()}
+    boundary = str(mesh.GetInterpolateBoundaryAttr().Get(time))
+    return Cage(
+        prim, opened * meters_per_unit, None if closed is None else closed * meters_per_unit,
+        _rest(mesh, opened) * meters_per_unit,
+        _topology(mesh, counts, indices, len(points), boundary, time, problems), number, np.isin(number, holes),
+        str(mesh.GetSubdivisionSchemeAttr().Get(time)), boundary,
+        str(mesh.GetFaceVaryingLinearInterpolationAttr().Get(time)),
+        mesh.GetOrientationAttr().Get(time) == UsdGeom.Tokens.leftHanded, bool(mesh.GetDoubleSidedAttr().Get(time)),
+        **found,
+    )  # fmt: skip
 
 
-def _topology(
-    mesh: UsdGeom.Mesh, time: Usd.TimeCode
-) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:  # fmt: skip
+# --- polygons --------------------------------------------------------------------------------------------------------
+
+
+def _polygons(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> tuple[Array, Ints, Ints]:
     stage = mesh.GetPrim().GetStage()
-    raw = mesh.GetPointsAttr().Get(time)
-    points = np.asarray(raw if raw is not None else [], dtype=np.float64).reshape(-1, 3)
-    counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get(time) or [], dtype=np.int64)
-    indices = np.asarray(mesh.GetFaceVertexIndicesAttr().Get(time) or [], dtype=np.int64)
-    if not np.isfinite(points).all():
-        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise UsdfabError(f"point {bad} is not finite", place=site(stage, mesh.GetPointsAttr()))
+    points = _points(mesh, mesh.GetPointsAttr().Get(time))
+    counts = _indices(mesh.GetFaceVertexCountsAttr(), time)
+    indices = _indices(mesh.GetFaceVertexIndicesAttr(), time)
     if (counts < 0).any() or counts.sum() != len(indices):
         raise UsdfabError(
             f"the face sizes ask for {int(counts.sum())} indices, there are {len(indices)}",
@@ -118,135 +135,113 @@ def _topology(
     return points, counts, indices
 
 
-# --- primvars --------------------------------------------------------------------------------------------------------
+def _points(mesh: UsdGeom.Mesh, raw: object) -> Array:
+    points = np.asarray(raw if raw is not None else [], dtype=np.float64).reshape(-1, 3)
+    if not np.isfinite(points).all():
+        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+        raise UsdfabError(f"point {bad} is not finite", place=site(mesh.GetPrim().GetStage(), mesh.GetPointsAttr()))
+    return points
 
 
-def _at_corners(
-    prim: Usd.Prim,
-    name: str,
-    values: Array,
-    interpolation: str,
-    sizes: dict[str, int],
-    corners: NDArray[np.int64],
-    faces: NDArray[np.int64] | None,
-    triangles: IntArray,
-) -> Array | None:
-    """(T, 3, width) values at the triangles' corners; None for an interpolation that has none."""
-    expected = sizes.get(interpolation)
-    if expected is None:
-        return None
-    place = site(prim.GetStage(), prim.GetPath().AppendProperty(name))
-    if len(values) != expected:
-        raise UsdfabError(f"{len(values)} values for {interpolation} interpolation, expected {expected}", place=place)
-    if not np.isfinite(values).all():
-        raise UsdfabError("a value is not finite", place=place)
-    if interpolation == UsdGeom.Tokens.faceVarying:
-        return values[corners]
-    if interpolation == UsdGeom.Tokens.uniform:
-        assert faces is not None
-        return np.repeat(values[faces][:, None], 3, axis=1)
-    return values[triangles]
+def _indices(attribute: Usd.Attribute, time: Usd.TimeCode) -> Ints:
+    raw = attribute.Get(time)
+    return np.asarray(raw if raw is not None else [], dtype=np.int64)
 
 
-def _normals(
-    mesh: UsdGeom.Mesh,
-    time: Usd.TimeCode,
-    counts: NDArray[np.int64],
-    corners: NDArray[np.int64],
-    faces: NDArray[np.int64],
-    triangles: IntArray,
-) -> Array | None:
-    """(T, 3, 3) authored normals in local space; ``primvars:normals`` goes before ``normals``, as in USD."""
-    prim, tokens = mesh.GetPrim(), UsdGeom.Tokens
-    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")
-    if primvar and primvar.HasValue():
-        name, interpolation, raw = "primvars:normals", primvar.GetInterpolation(), _flattened(primvar, time)
-    else:
-        name, interpolation, raw = "normals", mesh.GetNormalsInterpolation(), mesh.GetNormalsAttr().Get(time)
-    if raw is None or len(raw) == 0:
-        return None
-    points = len(mesh.GetPointsAttr().Get(time))
-    sizes = {
-        tokens.vertex: points,
-        tokens.varying: points,
-        tokens.uniform: len(counts),
-        tokens.faceVarying: int(counts.sum()),
-    }
-    values = np.asarray(raw, dtype=np.float64).reshape(-1, 3)
-    return _at_corners(prim, name, values, interpolation, sizes, corners, faces, triangles)
+def _moving_points(
+    mesh: UsdGeom.Mesh, points: Array, shutter: Shutter, problems: Problems
+) -> tuple[Array, Array | None]:
+    """Points as the shutter opens, and as it closes where they differ."""
+    if shutter.close is None:
+        return points, None
+    attributes = (mesh.GetPointsAttr(), mesh.GetVelocitiesAttr(), mesh.GetFaceVertexCountsAttr())
+    if not any(a.ValueMightBeTimeVarying() or a.GetNumTimeSamples() for a in attributes):
+        return points, None
+    opened, closed = (_points(mesh, mesh.ComputePointsAtTime(t, shutter.frame)) for t in (shutter.open, shutter.close))
+    faces = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
+    velocities = mesh.GetVelocitiesAttr().Get(shutter.frame)
+    carried = velocities is not None and len(velocities) == len(points)
+    same = carried or all(
+        np.array_equal(_indices(a, shutter.frame), _indices(a, t)) for a in faces for t in (shutter.open, shutter.close)
+    )
+    if not (same and len(opened) == len(closed) == len(points)):
+        problems.warn(f"{mesh.GetPath()}: points or faces change while the shutter is open, the mesh is not blurred")
+        return points, None
+    return opened, None if np.array_equal(opened, closed) else closed
 
 
-def _uv(
-    mesh: UsdGeom.Mesh, time: Usd.TimeCode, points: int, corners: NDArray[np.int64], triangles: IntArray
-) -> Array | None:
-    """(T, 3, 2) texture coordinates, or None."""
-    prim, tokens = mesh.GetPrim(), UsdGeom.Tokens
-    api = UsdGeom.PrimvarsAPI(prim)
-    candidates = [api.GetPrimvar(name) for name in UV_NAMES]
-    candidates += [p for p in api.GetPrimvarsWithValues() if p.GetTypeName() in _UV_TYPES]
-    sizes = {
-        tokens.vertex: points,
-        tokens.varying: points,
-        tokens.faceVarying: len(mesh.GetFaceVertexIndicesAttr().Get(time)),
-    }
-    for primvar in candidates:
-        if not (primvar and primvar.HasValue()) or primvar.GetInterpolation() not in sizes:
-            continue
-        raw = np.asarray(_flattened(primvar, time), dtype=np.float64)
-        if raw.ndim == 2 and raw.shape[1] == 2:
-            name = primvar.GetName()
-            return _at_corners(prim, name, raw, primvar.GetInterpolation(), sizes, corners, None, triangles)
-    return None
+def _rest(mesh: UsdGeom.Mesh, points: Array) -> Array:
+    raw = mesh.GetPointsAttr().Get(Usd.TimeCode.EarliestTime())
+    rest = np.asarray(raw if raw is not None else [], dtype=np.float64).reshape(-1, 3)
+    return rest if rest.shape == points.shape and np.isfinite(rest).all() else points
 
 
-def _flattened(primvar: UsdGeom.Primvar, time: Usd.TimeCode) -> Any:
-    """The primvar's values with its indices resolved; indices out of range are our error, not a silent gap."""
-    if primvar.IsIndexed():
-        values, indices = primvar.Get(time), np.asarray(primvar.GetIndices(time), dtype=np.int64)
-        if len(indices) and (indices.min() < 0 or indices.max() >= len(values)):
-            attribute = primvar.GetIndicesAttr()
-            place = site(attribute.GetStage(), attribute)
-            raise UsdfabError(f"an index is out of range, there are {len(values)} values", place=place)
-        return np.asarray(values)[indices]
-    return primvar.Get(time)
+def _topology(
+    mesh: UsdGeom.Mesh, counts: Ints, indices: Ints, points: int, boundary: str, time: Usd.TimeCode, problems: Problems
+) -> Topology:
+    """The faces with their creases and corners; creases that do not fit are faults, and left out."""
+    pairs, sharp = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
+    corners, corner_sharp = np.zeros(0, dtype=np.int64), np.zeros(0)
+    with problems.tolerating(str(mesh.GetPath()), "its creases and corners are left out"):
+        pairs, sharp = _creases(mesh, points, time)
+        corners = _indices(mesh.GetCornerIndicesAttr(), time)
+        raw = mesh.GetCornerSharpnessesAttr().Get(time)
+        corner_sharp = np.asarray(raw if raw is not None else [], dtype=np.float64)
+        if len(corners) != len(corner_sharp) or ((corners < 0) | (corners >= points)).any():
+            corners, corner_sharp = corners[:0], corner_sharp[:0]
+            place = site(mesh.GetPrim().GetStage(), mesh.GetCornerIndicesAttr())
+            raise UsdfabError("corner indices and sharpnesses do not fit", place=place)
+    return topology(
+        counts, indices, points, pairs, sharp, corners, corner_sharp, sharp_boundary_corners=boundary != "edgeOnly"
+    )
 
 
-def smooth_normals(points: Array, triangles: IntArray) -> Array:
-    """(T, 3, 3) unit normals at the corners: the mean of the normals around each point, weighted by area."""
-    p = points[triangles]
-    area = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
-    total = np.zeros_like(points)
-    for corner in range(3):
-        np.add.at(total, triangles[:, corner], area)
-    return _unit(total[triangles], p)
+def _creases(mesh: UsdGeom.Mesh, points: int, time: Usd.TimeCode) -> tuple[Ints, Array]:
+    """(n, 2) points of each creased edge, (n,) sharpness."""
+    indices = _indices(mesh.GetCreaseIndicesAttr(), time)
+    lengths = _indices(mesh.GetCreaseLengthsAttr(), time)
+    raw = mesh.GetCreaseSharpnessesAttr().Get(time)
+    sharp = np.asarray(raw if raw is not None else [], dtype=np.float64)
+    if len(indices) == 0:
+        return np.zeros((0, 2), dtype=np.int64), np.zeros(0)
+    edges = int((lengths - 1).sum())
+    fits = (lengths >= 2).all() and lengths.sum() == len(indices) and len(sharp) in (len(lengths), edges)
+    if not fits or ((indices < 0) | (indices >= points)).any() or not np.isfinite(sharp).all():
+        place = site(mesh.GetPrim().GetStage(), mesh.GetCreaseIndicesAttr())
+        raise UsdfabError("crease indices, lengths and sharpnesses do not fit", place=place)
+    last = np.cumsum(lengths) - 1
+    first = np.setdiff1d(np.arange(len(indices)), last)
+    return np.stack([indices[first], indices[first + 1]], axis=1), (
+        np.repeat(sharp, lengths - 1) if len(sharp) == len(lengths) else sharp
+    )
 
 
-def _unit(normals: Array, corners: Array) -> Array:
-    """Normals of length 1; where one is 0, the triangle's own (or z, where that is 0 as well)."""
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    flat[np.linalg.norm(flat, axis=1) == 0] = (0.0, 0.0, 1.0)
-    lengths = np.linalg.norm(normals, axis=2, keepdims=True)
-    normals = np.where(lengths > 0, normals, flat[:, None, :])
-    return normals / np.linalg.norm(normals, axis=2, keepdims=True)
+def _kept(values: Values | None, keep_face: NDArray[np.bool_], keep_corner: NDArray[np.bool_]) -> Values | None:
+    """The values of the faces that are kept."""
+    keep = {"uniform": keep_face, "faceVarying": keep_corner}.get(values.interpolation) if values else None
+    return values if values is None or keep is None else replace(values, values=values.values[keep])
 
 
 # --- material bindings -----------------------------------------------------------------------------------------------
 
 
-def _materials(prim: Usd.Prim, faces: int, time: Usd.TimeCode) -> tuple[list[Usd.Prim | None], NDArray[np.int64]]:
-    """Bound materials and, for each face, which of them it has."""
+def read_bindings(prim: Usd.Prim, time: Usd.TimeCode, problems: Problems) -> Bindings:
+    """Materials bound to a mesh and to subsets of its faces. A subset with indices out of range is a fault."""
+    counts = UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(time)
+    faces = 0 if counts is None else len(counts)
     materials: list[Usd.Prim | None] = [_bound(prim)]
     slot = np.zeros(faces, dtype=np.int64)
     for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
         if subset.GetElementTypeAttr().Get() != UsdGeom.Tokens.face:
             continue
-        indices = np.asarray(subset.GetIndicesAttr().Get(time) or [], dtype=np.int64)
-        if len(indices) and (indices.min() < 0 or indices.max() >= faces):
-            place = site(prim.GetStage(), subset.GetIndicesAttr())
-            raise UsdfabError(f"a face index is out of range, the mesh has {faces} faces", place=place)
-        slot[indices] = len(materials)
-        materials.append(_bound(subset.GetPrim()))
-    return materials, slot
+        with problems.tolerating(str(subset.GetPath()), "the subset is left out"):
+            indices = _indices(subset.GetIndicesAttr(), time)
+            if len(indices) and (indices.min() < 0 or indices.max() >= faces):
+                place = site(prim.GetStage(), subset.GetIndicesAttr())
+                raise UsdfabError(f"a face index is out of range, the mesh has {faces} faces", place=place)
+            slot[indices] = len(materials)
+            materials.append(_bound(subset.GetPrim()))
+    return Bindings(materials, slot)
 
 
 def _bound(prim: Usd.Prim) -> Usd.Prim | None:

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from pathlib import Path
 
-import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdShade
+from pxr import Usd, UsdGeom
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
-from usdfab.usd.fabric_io import fabric_from_prim, is_fabric, meters_per_uv_from_prim
-from usdfab.usd.read_lights import is_light, matrix, read_light
-from usdfab.usd.read_materials import read_material, unbound_material
-from usdfab.usd.read_mesh import RawMesh, read_mesh
-from usdfab.usd.scene import Array, Camera, FabricSurface, Light, Material, Mesh, Scene
-from usdfab.usd.stage import open_stage, site, stage_name
-
-_PURPOSES = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
+from usdfab.usd.collect import PURPOSES, Collector, Placed, drawn_prims
+from usdfab.usd.frames import Shutter, shutter as shutter_at, time_code as time_code
+from usdfab.usd.problems import Problems
+from usdfab.usd.read_camera import is_perspective, read_camera, shutter_of
+from usdfab.usd.read_lights import read_light
+from usdfab.usd.resolve import Resolver
+from usdfab.usd.scene import Array, Camera, Light, Scene
+from usdfab.usd.stage import open_stage, stage_name
 
 
 def read_scene(
@@ -26,11 +24,19 @@ def read_scene(
     time: float | None = None,
     camera: str | None = None,
     fabric_override: FabricParameters | None = None,
+    *,
+    shutter: bool = True,
+    subdivision: int | None = None,
+    strict: bool = False,
+    placements: bool = True,
+    purposes: tuple[str, ...] = PURPOSES,
 ) -> Scene:
     """What a renderer needs of a stage.
 
-    Visible prims of purpose ``default`` and ``render`` are read, instances included. Lights, cameras and meshes that
-    usdfab does not support are named in ``Scene.warnings``, as are other shapes (spheres, curves, point instancers).
+    Visible prims of the wanted purposes are read, native instances and point instancers included. Lights, cameras and
+    shapes that usdfab does not support are named in ``Scene.warnings``, as is everything that is approximated.
+
+    Cloth without usable texture coordinates is unwrapped in metres. Variants are as the stage selects them.
 
     Parameters
     ----------
@@ -40,227 +46,127 @@ def read_scene(
         Path of a camera, which then comes first in ``Scene.cameras``.
     fabric_override:
         Replaces every bound fabric. If no mesh has one, it goes on the meshes that have texture coordinates and no
-        material at all; if there is none of these either, on the only mesh with texture coordinates.
+        material at all; if there is none of these either, on the only mesh with texture coordinates, or the only mesh.
+    shutter:
+        Read the ends of motion while the shutter of the chosen (or first) camera is open.
+    subdivision:
+        Steps of refinement of subdivision surfaces; None: by their size (``usdfab.usd.tessellate``).
+    strict:
+        Raise at the first thing that is wrong; else the prim is left out, or falls back, with a warning.
+    placements:
+        Whether copies may be ``Mesh.placements``. If not, native instances are meshes of their own, and point
+        instancers are left out with a warning.
+    purposes:
+        ``default``, ``render``, ``proxy``, ``guide``.
 
     Raises
     ------
     UsdfabError
-        If the stage cannot be opened, is empty or has no mesh; for a mesh that carries a fabric but no texture
-        coordinates (or coordinates without area); points that are not finite, indices out of range, primvars of the
-        wrong length; a missing camera; and when there is no mesh, or no single one, for ``fabric_override``.
+        If the stage cannot be opened, is empty or has no mesh that can be drawn; for a missing camera; and when there
+        is no mesh, or no single one, for ``fabric_override``. With ``strict`` also for prims that are wrong: values
+        that are not finite, singular transforms, indices out of range, primvars of the wrong length, lights and meshes
+        without area, missing images, fabrics with values out of range.
     """
     stage = open_stage(source)
-    reader = _Reader(stage, time_code(stage, time))
-    reader.collect()
-    if not reader.raw_meshes:
-        empty = not any(True for _ in stage.TraverseAll())
-        problem = "the stage is empty" if empty else "there is no visible mesh in this stage"
-        raise UsdfabError(problem, place=stage_name(stage), remedy="usdfab renders polygon meshes")
-    cameras = _chosen_first(stage, reader.cameras, camera)
-    meshes = reader.resolve(fabric_override)
+    frame = time_code(stage, time)
+    meters = UsdGeom.GetStageMetersPerUnit(stage)
+    if not (math.isfinite(meters) and meters > 0):
+        raise UsdfabError(f"metersPerUnit is {meters}", place=stage_name(stage), remedy="author it")
+    problems = Problems(strict=strict)
+    problems.warn(*(f"composition: {' '.join(str(error).split())}" for error in stage.GetCompositionErrors()))
+    span = _shutter(stage, frame, camera, purposes, problems) if shutter else Shutter.still(frame)
+    collector = Collector(stage, span, problems, purposes, instancers=placements)
+    collector.collect()
+    cameras = _chosen_first(stage, collector.cameras, camera, meters, frame, problems)
+    lights = _lights(collector.lights, meters, frame, problems)
+    resolver = Resolver(stage, span, problems, share=placements, subdivision=subdivision)
+    meshes = resolver.resolve(collector.meshes, fabric_override)
+    if not meshes:
+        raise _nothing(stage, problems)
     return Scene(
         stage_name(stage),
         meshes,
-        tuple(reader.materials),
-        tuple(reader.fabrics),
+        tuple(resolver.materials),
+        tuple(resolver.fabrics),
         cameras,
-        tuple(reader.lights),
-        tuple(reader.warnings + reader.left_out()),
+        lights,
+        (*problems.warnings, *collector.left_out()),
         str(UsdGeom.GetStageUpAxis(stage)),
     )
 
 
-def time_code(stage: Usd.Stage, time: float | None) -> Usd.TimeCode:
-    """The time code that ``read_scene`` reads at: ``time``, or the stage's start, or the earliest sample."""
-    if time is not None:
-        if not math.isfinite(time):
-            raise UsdfabError(f"{time} is not a time code", place="time")
-        return Usd.TimeCode(time)
-    return Usd.TimeCode(stage.GetStartTimeCode()) if stage.HasAuthoredTimeCodeRange() else Usd.TimeCode.EarliestTime()
+def _nothing(stage: Usd.Stage, problems: Problems) -> UsdfabError:
+    """The error for a stage of which no mesh is left."""
+    if not any(True for _ in stage.TraverseAll()):
+        return UsdfabError("the stage is empty", place=stage_name(stage), remedy="usdfab renders polygon meshes")
+    if problems.first is not None:
+        found = problems.first
+        problem = f"no mesh can be drawn: {found.problem}"
+        return UsdfabError(problem, place=found.place or stage_name(stage), remedy=found.remedy)
+    problem = "there is no visible mesh in this stage"
+    return UsdfabError(problem, place=stage_name(stage), remedy="usdfab renders polygon meshes")
 
 
-def _chosen_first(stage: Usd.Stage, cameras: list[Camera], wanted: str | None) -> tuple[Camera, ...]:
-    if wanted is None:
-        return tuple(cameras)
-    chosen = [c for c in cameras if c.path == wanted]
-    if not chosen:
+# --- cameras and lights ----------------------------------------------------------------------------------------------
+
+
+def _shutter(
+    stage: Usd.Stage, frame: Usd.TimeCode, camera: str | None, purposes: tuple[str, ...], problems: Problems
+) -> Shutter:
+    """The shutter of the chosen camera, or of the first that usdfab can render through."""
+    for prim in drawn_prims(stage, frame, purposes):
+        if not prim.IsA(UsdGeom.Camera) or camera not in (None, str(prim.GetPath())):
+            continue
+        if is_perspective(prim, frame):
+            opening, closing = 0.0, 0.0
+            with problems.tolerating(str(prim.GetPath()), "nothing is blurred"):
+                opening, closing = shutter_of(prim, frame)
+            if closing < opening:
+                problems.warn(f"{prim.GetPath()}: the shutter closes before it opens, nothing is blurred")
+            return shutter_at(frame, opening, closing)
+    return Shutter.still(frame)
+
+
+def _single(places: Array | None) -> Array | None:
+    return None if places is None else places[0]
+
+
+def _chosen_first(
+    stage: Usd.Stage, placed: list[Placed], wanted: str | None, meters: float, frame: Usd.TimeCode, problems: Problems
+) -> tuple[Camera, ...]:
+    """The stage's perspective cameras, ``wanted`` first."""
+    cameras: list[Camera] = []
+    for place in placed:
+        path = str(place.prim.GetPath())
+        if not is_perspective(place.prim, frame):
+            problems.warn(f"{path}: only perspective cameras are supported, left out")
+            continue
+        if path == wanted:
+            # Nothing can stand in for the camera that was asked for.
+            found, warnings = read_camera(
+                place.prim, place.to_world[0], _single(place.to_world_close), meters, frame
+            )  # fmt: skip
+            problems.warn(*warnings)
+            cameras.insert(0, found)
+            continue
+        with problems.tolerating(path, "the camera is left out"):
+            found, warnings = read_camera(
+                place.prim, place.to_world[0], _single(place.to_world_close), meters, frame
+            )  # fmt: skip
+            problems.warn(*warnings)
+            cameras.append(found)
+    if wanted is not None and not any(c.path == wanted for c in cameras):
         names = ", ".join(c.path for c in cameras)
         remedy = f"choose one of {names}" if names else "the stage has no perspective camera"
         raise UsdfabError("there is no such camera", place=f"{stage_name(stage)}<{wanted}>", remedy=remedy)
-    return (*chosen, *(c for c in cameras if c.path != wanted))
+    return tuple(cameras)
 
 
-class _Reader:
-    """Collects a stage's prims, then gives meshes their materials and fabrics."""
-
-    def __init__(self, stage: Usd.Stage, time: Usd.TimeCode) -> None:
-        self.stage, self.time = stage, time
-        self.meters = UsdGeom.GetStageMetersPerUnit(stage)
-        self.transforms = UsdGeom.XformCache(time)
-        self.raw_meshes: list[RawMesh] = []
-        self.cameras: list[Camera] = []
-        self.lights: list[Light] = []
-        self.materials: list[Material] = []
-        self.fabrics: list[FabricSurface] = []
-        self.warnings = [f"composition: {_one_line(e)}" for e in stage.GetCompositionErrors()]
-        self.unsupported: Counter[str] = Counter()
-        self.material_index: dict[Sdf.Path, int] = {}
-
-    # --- the prims ---
-
-    def collect(self) -> None:
-        """Read meshes, cameras and lights."""
-        if not (math.isfinite(self.meters) and self.meters > 0):
-            raise UsdfabError(f"metersPerUnit is {self.meters}", place=stage_name(self.stage), remedy="author it")
-        prims = iter(Usd.PrimRange.Stage(self.stage, Usd.TraverseInstanceProxies()))
-        for prim in prims:
-            imageable = UsdGeom.Imageable(prim)
-            if imageable and imageable.GetVisibilityAttr().Get(self.time) == UsdGeom.Tokens.invisible:
-                prims.PruneChildren()
-            elif prim.IsA(UsdGeom.PointInstancer):
-                # Its prototypes may lie below it and are not shapes of their own.
-                self.unsupported["PointInstancer"] += 1
-                prims.PruneChildren()
-            elif imageable and imageable.ComputePurpose() in _PURPOSES:
-                self._read(prim)
-
-    def _read(self, prim: Usd.Prim) -> None:
-        to_world = matrix(self.transforms.GetLocalToWorldTransform(prim))
-        if is_light(prim):
-            light, warnings = read_light(prim, to_world, self.meters, self.time)
-            self.warnings += warnings
-            self.lights += [light] if light else []
-        if prim.IsA(UsdGeom.Mesh):
-            mesh, warnings = read_mesh(prim, to_world, self.meters, self.time)
-            self.warnings += warnings
-            self.raw_meshes += [mesh] if mesh else []
-        elif prim.IsA(UsdGeom.Camera):
-            self._read_camera(prim, to_world)
-        elif prim.IsA(UsdGeom.Gprim):
-            self.unsupported[prim.GetTypeName()] += 1
-
-    def left_out(self) -> list[str]:
-        """A warning for each type of shape that was met and not read."""
-        return [f"{count} prims of type {kind} are not supported, left out" for kind, count in self.unsupported.items()]
-
-    def _read_camera(self, prim: Usd.Prim, to_world: Array) -> None:
-        camera = UsdGeom.Camera(prim)
-        place = str(prim.GetPath())
-        if camera.GetProjectionAttr().Get(self.time) != UsdGeom.Tokens.perspective:
-            self.warnings.append(f"{place}: only perspective cameras are supported, left out")
-            return
-        aperture, offset = (
-            np.array([float(a.Get(self.time)) for a in pair])
-            for pair in (
-                (camera.GetHorizontalApertureAttr(), camera.GetVerticalApertureAttr()),
-                (camera.GetHorizontalApertureOffsetAttr(), camera.GetVerticalApertureOffsetAttr()),
-            )
-        )
-        focal = float(camera.GetFocalLengthAttr().Get(self.time))
-        exposure = math.log2(max(float(camera.ComputeLinearExposureScale(self.time)), 1e-300))
-        u, scale, vt = np.linalg.svd(to_world[:3, :3])
-        numbers = np.array([focal, *aperture, *offset, exposure, *scale])
-        if not np.isfinite(numbers).all() or focal <= 0 or (aperture <= 0).any() or scale[-1] == 0:
-            raise UsdfabError("focal length, apertures and transform must be above 0", place=site(self.stage, prim))
-        rigid = np.eye(4)
-        rigid[:3, :3] = u @ vt
-        rigid[:3, 3] = to_world[:3, 3] * self.meters
-        self.cameras.append(Camera(place, rigid, aperture / (2.0 * focal), 2.0 * offset / aperture, exposure))
-
-    # --- materials and fabrics ---
-
-    def resolve(self, override: FabricParameters | None) -> tuple[Mesh, ...]:
-        """The meshes with their materials; fills ``materials`` and ``fabrics``."""
-        extra = set() if override is None else self._override_targets()
-        return tuple(
-            Mesh(
-                str(raw.prim.GetPath()), raw.points, raw.triangles, raw.normals, raw.uv,
-                self._face_materials(raw, override, number in extra), raw.double_sided,
-            )
-            for number, raw in enumerate(self.raw_meshes)
-        )  # fmt: skip
-
-    def _override_targets(self) -> set[int]:
-        """Numbers of the meshes that get the override although no fabric is bound to them (see ``read_scene``)."""
-        if any(is_fabric(m) for raw in self.raw_meshes for m in raw.materials if m):
-            return set()
-        with_uv = [i for i, raw in enumerate(self.raw_meshes) if raw.uv is not None]
-        free = [i for i in with_uv if not any(self.raw_meshes[i].materials)]
-        if free:
-            return set(free)
-        if len(with_uv) == 1:
-            return set(with_uv)
-        names = ", ".join(str(self.raw_meshes[i].prim.GetPath()) for i in with_uv)
-        raise UsdfabError(
-            f"which mesh is cloth? All have other materials ({names})" if names else "no mesh has texture coordinates",
-            place=stage_name(self.stage),
-            remedy="bind the fabric to a mesh with `usdfab bind`" if names else "add a primvar 'st' to the cloth",
-        )
-
-    def _face_materials(self, raw: RawMesh, override: FabricParameters | None, force: bool) -> np.ndarray:
-        """(T,) int32 indices into ``materials``."""
-        index = np.zeros(len(raw.materials), dtype=np.int32)
-        for slot, prim in enumerate(raw.materials):
-            faces = raw.slot == slot
-            if not faces.any():
-                continue
-            if force or (prim and is_fabric(prim)):
-                index[slot] = self._add_fabric(raw, prim, faces, override)
-            elif prim:
-                index[slot] = self._shared_material(prim)
-            else:
-                index[slot] = self._append(unbound_material(raw.prim, self.time))
-        return index[raw.slot]
-
-    def _append(self, material: Material) -> int:
-        self.materials.append(material)
-        return len(self.materials) - 1
-
-    def _shared_material(self, prim: Usd.Prim) -> int:
-        if prim.GetPath() not in self.material_index:
-            material, warnings = read_material(prim, self.time)
-            self.warnings += warnings
-            self.material_index[prim.GetPath()] = self._append(material)
-        return self.material_index[prim.GetPath()]
-
-    def _add_fabric(
-        self, raw: RawMesh, prim: Usd.Prim | None, faces: np.ndarray, override: FabricParameters | None
-    ) -> int:
-        """A FabricSurface and its material for the triangles ``faces`` of one mesh."""
-        bound = prim is not None and is_fabric(prim)
-        fabric = override if override is not None else fabric_from_prim(prim)
-        meters = meters_per_uv_from_prim(prim) if bound else 0.0
-        measured = meters_per_uv(raw, faces, self.stage)
-        path = str(prim.GetPath()) if prim else str(raw.prim.GetPath())
-        self.fabrics.append(FabricSurface(path, fabric, meters or measured))
-        is_surface = prim is not None and UsdShade.Material(prim)
-        look, _ = read_material(prim, self.time) if is_surface else (unbound_material(raw.prim, self.time), [])
-        return self._append(
-            Material(path, len(self.fabrics) - 1, look.base_color, look.roughness, look.metallic, look.opacity)
-        )
-
-
-def meters_per_uv(raw: RawMesh, faces: np.ndarray, stage: Usd.Stage) -> float:
-    """sqrt(area on the surface / area in uv) over the triangles ``faces``; errors for a mesh without usable uv."""
-    place = site(stage, raw.prim)
-    if raw.uv is None:
-        raise UsdfabError(
-            "the mesh carries a fabric but has no texture coordinates",
-            place=place,
-            remedy="add a primvar 'st' (texCoord2f[], vertex or faceVarying), in your modelling program: unwrap it",
-        )
-    uv = raw.uv[faces]
-    edges = uv[:, 1:] - uv[:, :1]
-    uv_area = 0.5 * np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]).sum()
-    area = raw.areas()[faces].sum()
-    if not (uv_area > 0 and area > 0):
-        raise UsdfabError(
-            "the texture coordinates of the cloth cover no area" if area > 0 else "the cloth has no area",
-            place=place,
-            remedy="unwrap the mesh anew",
-        )
-    return float(np.sqrt(area / uv_area))
-
-
-def _one_line(error: object) -> str:
-    return " ".join(str(error).split())
+def _lights(placed: list[Placed], meters: float, frame: Usd.TimeCode, problems: Problems) -> tuple[Light, ...]:
+    lights: list[Light] = []
+    for place in placed:
+        with problems.tolerating(str(place.prim.GetPath()), "the light is left out"):
+            light, warnings = read_light(place.prim, place.to_world[0], meters, frame)
+            problems.warn(*warnings)
+            lights += [light] if light else []
+    return tuple(lights)

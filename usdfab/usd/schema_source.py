@@ -142,6 +142,12 @@ FABRIC_ATTRIBUTES: tuple[SchemaAttribute, ...] = (
         "Length on the cloth of one unit of its texture coordinates, in metres. 0: measured on each surface, "
         "sqrt(area on the surface / area in uv).\nUnits: m\nRange: [0, inf)", (0.0, math.inf),
     ),
+    SchemaAttribute(
+        "albedoMap", "albedo_map", "asset", "", "@@", "Albedo map", "Fabric",
+        "Image that multiplies the fiber albedo, looked up with the texture coordinates of the cloth, repeated beyond "
+        "them. OpenEXR and Radiance files are linear Rec. 709, others sRGB. Not authored, or empty: none. The primvar "
+        "usdfab:albedo of a mesh multiplies the albedo likewise.", since=2,
+    ),
     _text("provenance:source", "source", "Source", "The photo or file that the parameters come from."),
     _text("provenance:sourceSha256", "source_sha256", "Source SHA-256", "SHA-256 of the source file, hexadecimal."),
     _text("provenance:generator", "generator", "Generator", "Program and version that wrote the parameters."),
