@@ -50,6 +50,7 @@ from usdfab.errors import UsdfabError
 
 __all__ = [
     "ALPHA_MIN",
+    "PREPARED_SURFACE",
     "SURFACE_SIZE",
     "eval_surface",
     "load_surface",
@@ -63,6 +64,9 @@ ALPHA_MIN = 1e-3
 
 SURFACE_SIZE = 12
 """Length of the array that `pack_surface` returns."""
+
+PREPARED_SURFACE = 19
+"""Length of the tuple that `prepare_surface` returns."""
 
 # Layout of the packed material `p`: 0:3 base colour, 3 roughness, 4 metallic, 5:8 F0 before metallic, 8 whether it is
 # the specular workflow, which ignores metallic, 9 coat, 10 its roughness, 11 its F0.

@@ -17,6 +17,8 @@ import numpy as np
 from numba import njit
 
 from usdfab.scattering.fiber_numba import (
+    FIBER_SIZE,
+    PREPARED_FIBER,
     eval_fiber,
     fiber_angles,
     fiber_direction,
@@ -24,8 +26,9 @@ from usdfab.scattering.fiber_numba import (
     load_fiber,
     prepare_fiber,
     sample_fiber,
+    sample_fiber_lobe,
 )
-from usdfab.scattering.surface_numba import eval_surface, prepare_surface, sample_surface
+from usdfab.scattering.surface_numba import PREPARED_SURFACE, eval_surface, prepare_surface, sample_surface
 from usdfab.tracer.counted import mix, next_uniform, start_stream
 from usdfab.tracer.film import ALBEDO, ALPHA, DEPTH, DIRECT, FIBER_ID, NORMAL, RAYS, SAMPLES, UV, YARN_ID
 from usdfab.tracer.intrinsics import NG, PRIM, U, borrow, new_ray_buffer
@@ -42,6 +45,12 @@ SHADOW_ROULETTE = 2.0 * math.pi
 Fibers scatter into narrow lobes: at most vertices next to nothing goes towards a lamp, and the few that matter make the
 noise. So the rays that are saved here (nine of ten) cost hardly any variance.
 """
+
+
+_NO_FIBER = (0.0,) * FIBER_SIZE
+_NOT_PREPARED = (0.0,) * PREPARED_FIBER
+_NO_SURFACE = (0.0,) * PREPARED_SURFACE
+"""Of the right types, for variables that a fiber or a surface sets and nobody else reads."""
 
 
 @njit(cache=True)
@@ -151,8 +160,9 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                 px, py, pz = to_patch(m, dx, dy, dz)
                 stretch = math.sqrt(px * px + py * py + pz * pz)
                 outcome, t, lx, ly, lz, ix, iy, patch = trace_slab(
-                    world, buffer, first_patch, variants, lx, ly, lz, ix, iy, px / stretch, py / stretch, pz / stretch
-                )
+                    world.embree[0], patches.table, patches.handles, buffer, first_patch, variants, lx, ly, lz, ix, iy,
+                    px / stretch, py / stretch, pz / stretch,
+                )  # fmt: skip
                 out[RAYS] += 1.0
                 t /= stretch
                 travelled += t
@@ -216,9 +226,7 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
 
         # Shading frame at the interaction.
         floats, words, _address = buffer
-        fiber_material = load_fiber(patches.materials, 0)
-        prepared = prepare_fiber(fiber_material, 0.0, 0.0, 1.0)
-        surface = prepare_surface((0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0), 1.0)
+        fiber_material, prepared, surface = _NO_FIBER, _NOT_PREPARED, _NO_SURFACE
         shading = m
         ax = ay = az = ex = ey = ez = fx = fy = fz = 0.0
         wox = woy = woz = 0.0
@@ -324,8 +332,8 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                         px, py, pz = to_patch(m, wx, wy, wz)
                         stretch = math.sqrt(px * px + py * py + pz * pz)
                         blocked, through = slab_occluded(
-                            world, buffer, first_patch, variants, lx, ly, lz, ix, iy, px / stretch, py / stretch,
-                            pz / stretch, reach * stretch,
+                            world.embree[1], patches.table, patches.handles, buffer, first_patch, variants, lx, ly, lz,
+                            ix, iy, px / stretch, py / stretch, pz / stretch, reach * stretch,
                         )  # fmt: skip
                         share = 0.0 if blocked else 1.0
                         if not blocked and through < reach * stretch:
@@ -352,7 +360,11 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
         stream, u2 = next_uniform(stream)
         if fiber:
             stream, u3 = next_uniform(stream)
-            sin_ti, cos_ti, phi, wr, wg, wb, bsdf_pdf = sample_fiber(fiber_material, prepared, u0, u1, u2, u3)
+            if lights.deltas:
+                sin_ti, cos_ti, phi, wr, wg, wb = sample_fiber_lobe(fiber_material, prepared, u0, u1, u2, u3)
+                bsdf_pdf = 1.0
+            else:
+                sin_ti, cos_ti, phi, wr, wg, wb, bsdf_pdf = sample_fiber(fiber_material, prepared, u0, u1, u2, u3)
             dx, dy, dz = fiber_direction(ax, ay, az, ex, ey, ez, fx, fy, fz, sin_ti, cos_ti, phi)
         else:
             qx, qy, qz, wr, wg, wb, bsdf_pdf = sample_surface(surface, wox, woy, woz, u0, u1, u2)

@@ -69,12 +69,14 @@ _INLINE: dict[str, Any] = {**_OPTIONS, "forceinline": True}
 
 
 class Lights(NamedTuple):
-    """Packed lights. ``table`` (L, COLUMNS); the dome's texture with its distribution over rows and columns."""
+    """Packed lights. ``table`` (L, COLUMNS); the dome's texture with its distribution over rows and columns; whether
+    no light has an extent, so that no ray can meet one."""
 
     table: NDArray[np.float64]
     image: NDArray[np.float32]
     rows: NDArray[np.float64]
     columns: NDArray[np.float32]
+    deltas: bool
 
 
 def pack_lights(scene: Scene, textures: Mapping[str, NDArray[np.float32]]) -> Lights:
@@ -101,7 +103,8 @@ def pack_lights(scene: Scene, textures: Mapping[str, NDArray[np.float32]]) -> Li
             record[1] *= image.mean(dtype=np.float64)
         if not np.isfinite(record).all():
             raise UsdfabError("the light has numbers that are not finite", place=light.path, remedy="repair it")
-    return Lights(table, image, rows, columns)
+    deltas = (table[:, 0] == POINT) | ((table[:, 0] == DISTANT) & (table[:, 8] >= _DELTA_COS))
+    return Lights(table, image, rows, columns, bool(deltas.all()))
 
 
 def _pack(light: Light, record: NDArray[np.float64]) -> None:

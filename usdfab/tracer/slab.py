@@ -132,23 +132,25 @@ def _step(width, height, low, high, lx, ly, lz, dx, dy, dz):
     return t, axis
 
 
-@njit(cache=True)
-def trace_slab(world, buffer, first, count, lx, ly, lz, ix, iy, dx, dy, dz):
+@njit(cache=True, forceinline=True)
+def trace_slab(trace, table, handles, buffer, first, count, lx, ly, lz, ix, iy, dx, dy, dz):
     """Nearest fiber along a ray in patch space.
+
+    Parameters
+    ----------
+    trace, table, handles:
+        Address of rtcIntersect1; of ``Patches``. (Not the whole world: it would be copied onto the stack.)
 
     Returns
     -------
     (outcome, distance, place in its tile (3), tile (2), patch); on ``HIT`` the hit's other fields are in the buffer.
     """
-    table = world.patches.table
     width, height, low, high = table[first, WIDTH], table[first, HEIGHT], table[first, LOW], table[first, HIGH]
     total, near = 0.0, table[first, EPSILON]
     patch = variant_at(first, count, ix, iy)
     for _ in range(MAX_TILES):
         t, axis = _step(width, height, low, high, lx, ly, lz, dx, dy, dz)
-        if t > near and intersect(
-            world.embree[0], world.patches.handles[patch], buffer, lx, ly, lz, dx, dy, dz, near, t, ARGS_FILTER
-        ):
+        if t > near and intersect(trace, handles[patch], buffer, lx, ly, lz, dx, dy, dz, near, t, ARGS_FILTER):
             hit = np.float64(buffer[0][TFAR])
             return HIT, total + hit, lx + hit * dx, ly + hit * dy, lz + hit * dz, ix, iy, patch
         total += t
@@ -165,16 +167,18 @@ def trace_slab(world, buffer, first, count, lx, ly, lz, ix, iy, dx, dy, dz):
 
 
 @njit(cache=True)
-def slab_occluded(world, buffer, first, count, lx, ly, lz, ix, iy, dx, dy, dz, tmax):
-    """Whether a fiber lies on a ray in patch space before it leaves the slab: (occluded, distance to the exit)."""
-    table = world.patches.table
+def slab_occluded(trace, table, handles, buffer, first, count, lx, ly, lz, ix, iy, dx, dy, dz, tmax):
+    """Whether a fiber lies on a ray in patch space before it leaves the slab: (occluded, distance to the exit).
+
+    ``trace`` is the address of rtcOccluded1, the rest as for ``trace_slab``.
+    """
     width, height, low, high = table[first, WIDTH], table[first, HEIGHT], table[first, LOW], table[first, HIGH]
     total, near = 0.0, table[first, EPSILON]
     for _ in range(MAX_TILES):
         t, axis = _step(width, height, low, high, lx, ly, lz, dx, dy, dz)
         end = min(t, tmax - total)
-        handle = world.patches.handles[variant_at(first, count, ix, iy)]
-        if end > near and occluded(world.embree[1], handle, buffer, lx, ly, lz, dx, dy, dz, near, end, ARGS_FILTER):
+        handle = handles[variant_at(first, count, ix, iy)]
+        if end > near and occluded(trace, handle, buffer, lx, ly, lz, dx, dy, dz, near, end, ARGS_FILTER):
             return True, total
         total += t
         if total >= tmax:

@@ -177,8 +177,8 @@ def transmittance(world, buffer, time, ox, oy, oz, dx, dy, dz, near, tmax, skip_
         px, py, pz = to_patch(m, dx, dy, dz)
         stretch = math.sqrt(px * px + py * py + pz * pz)
         blocked, through = slab_occluded(
-            world, buffer, first, count, lx, ly, lz, ix, iy, px / stretch, py / stretch, pz / stretch,
-            (tmax - t + back) * stretch,
+            world.embree[1], world.patches.table, world.patches.handles, buffer, first, count, lx, ly, lz, ix, iy,
+            px / stretch, py / stretch, pz / stretch, (tmax - t + back) * stretch,
         )  # fmt: skip
         if blocked:
             return 0.0

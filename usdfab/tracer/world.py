@@ -148,6 +148,6 @@ def borrowed(world):
         patches,
         Materials(borrow(s.rows), borrow(s.textures)),
         Textures(borrow(t.texels), borrow(t.table)),
-        Lights(borrow(li.table), borrow(li.image), borrow(li.rows), borrow(li.columns)),
+        Lights(borrow(li.table), borrow(li.image), borrow(li.rows), borrow(li.columns), li.deltas),
         world.embree,
     )
