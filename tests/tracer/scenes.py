@@ -14,7 +14,7 @@ from usdfab.usd.scene import Camera, DomeLight, FabricSurface, Light, Material, 
 GRAY = (0.5, 0.5, 0.5)
 
 
-def fabric(weave: str = "plain", fibers: int = 12, **changes) -> FabricParameters:
+def fabric(weave: str = "plain", fibers: int = 12, variants: int = 1, **changes) -> FabricParameters:
     """5 mm of cloth with ten yarns each way, rough fibers (little noise), Mitsuba's three roughnesses in two."""
     values = {
         "count": 10,
@@ -28,7 +28,7 @@ def fabric(weave: str = "plain", fibers: int = 12, **changes) -> FabricParameter
         "irregularity": 0.2,
     }
     yarn = YarnParameters(**(values | changes))
-    return FabricParameters(weave_from_name(weave), (5e-3, 5e-3), yarn, yarn)
+    return FabricParameters(weave_from_name(weave), (5e-3, 5e-3), yarn, yarn, variants=variants)
 
 
 def swatch(cloth: FabricParameters, *lights: Light, zoom: float = 0.4) -> tuple[Scene, Camera]:
@@ -93,7 +93,7 @@ def strip(radius: float = 0.02) -> Mesh:
 
 def lambert(color=GRAY) -> Material:
     """A diffuse material."""
-    return Material("/Lambert", -1, np.asarray(color, dtype=float), 1.0, 0.0, 1.0)
+    return Material("/Lambert", -1, np.asarray(color, dtype=float), 1.0, 0.0, 1.0, ior=1.0)
 
 
 def cloth_material(index: int = 0) -> Material:

@@ -12,7 +12,7 @@ from numba import njit
 from scenes import fabric
 
 from usdfab.tracer import embree, patch_scene
-from usdfab.tracer.embree import NEIGHBOR_LEFT, NEIGHBOR_RIGHT, curve_scene, triangle_scene
+from usdfab.tracer.embree import NEIGHBOR_LEFT, NEIGHBOR_RIGHT, EmbreeScene, add_triangles, curve_scene
 from usdfab.tracer.intrinsics import (
     ARGS_FILTER,
     ARGS_PLAIN,
@@ -66,6 +66,13 @@ def rod():
     vertices = np.c_[np.arange(4.0), np.zeros((4, 2)), np.full(4, 0.1)]
     flags = np.array([NEIGHBOR_RIGHT, NEIGHBOR_LEFT | NEIGHBOR_RIGHT, NEIGHBOR_LEFT])
     return curve_scene(vertices, np.arange(3), flags)
+
+
+def triangle_scene(points, triangles):
+    """A committed scene of triangles."""
+    scene = EmbreeScene()
+    add_triangles(scene, np.asarray(points, dtype=float), triangles)
+    return scene.commit()
 
 
 def test_version():
@@ -145,7 +152,8 @@ def test_hits_on_a_patch_lie_on_their_fiber(fibers):
     vertices = tile.scene._buffers[0][: -embree._PADDING].view(np.float32).reshape(-1, 4)[:, :].astype(float)
     some = hit.hit
     assert some.mean() > 0.5
-    first = tile.segment_vertex[hit.prim[some]]
+    segments = tile.scene._buffers[1][: -embree._PADDING].view(np.uint32).astype(np.int64)
+    first = segments[hit.prim[some]]
     a, b, radius = vertices[first, :3], vertices[first + 1, :3], vertices[first, 3]
     place = origins[some] + hit.t[some, None] * directions[some]
     along = np.einsum("kx,kx->k", place - a, b - a) / np.einsum("kx,kx->k", b - a, b - a)

@@ -39,7 +39,7 @@ def test_fast_equals_reference_closely(name, depth, spp, monkeypatch):
 
 
 def check(name, depth, spp, side, monkeypatch):
-    monkeypatch.setattr(render_module, "build_patch_scene", lambda cloth: build_patch_scene(cloth, PATCH))
+    monkeypatch.setattr(render_module, "build_tiles", lambda cloth: [build_patch_scene(cloth, PATCH)])
     light = LIGHTS[name]
     scene, camera = swatch(CLOTH, *([light] if light else []), zoom=0.3)
     # The swatch's plane shows the cloth's middle at the world's origin.

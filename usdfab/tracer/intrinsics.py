@@ -6,6 +6,8 @@ view has the integer fields. Offsets below are in 4-byte words.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from llvmlite import ir
 from numba import carray, cfunc, njit, types
@@ -47,12 +49,7 @@ def _as_pointer(typingctx, address):
     return signature, codegen
 
 
-@intrinsic
-def borrow(typingctx, array):
-    """The same array without its owner, so that kernels do not count references (atomic operations on shared memory).
-
-    The caller keeps the array alive.
-    """
+def _borrow(typingctx, array):
     signature = array(array)
 
     def codegen(context, builder, signature, args):
@@ -62,6 +59,13 @@ def borrow(typingctx, array):
         return view._getvalue()
 
     return signature, codegen
+
+
+borrow: Any = intrinsic(_borrow)
+"""The same array without its owner, so that kernels do not count references (atomic operations on shared memory).
+
+The caller keeps the array alive.
+"""
 
 
 @cfunc(types.void(types.CPointer(types.uint64)), cache=True)

@@ -39,13 +39,13 @@ from usdfab.tracer.textures import lookup, normal_at, opacity_at, surface_at
 from usdfab.tracer.world import ALBEDO_MAP, FIRST_CURVE, FIRST_PATCH, FIRST_SEGMENT, borrowed
 
 RUSSIAN_ROULETTE_DEPTH = 5
-SHADOW_ROULETTE = 2.0 * math.pi
-"""Light that would arrive with less than half of what isotropic scattering gives gets its shadow ray by chance only.
+SHADOW_ROULETTE = 4.0 * math.pi
+"""From the second vertex on, light that would arrive with less than what isotropic scattering gives gets its shadow ray
+by chance only.
 
 Fibers scatter into narrow lobes: at most vertices next to nothing goes towards a lamp, and the few that matter make the
 noise. So the rays that are saved here (nine of ten) cost hardly any variance.
 """
-
 
 _NO_FIBER = (0.0,) * FIBER_SIZE
 _NOT_PREPARED = (0.0,) * PREPARED_FIBER
@@ -138,13 +138,14 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
     # Where the BSDF drew the direction: light sampling is judged from there.
     sx, sy, sz = ox, oy, oz
     in_slab = False
-    near, skip_mesh, skip_distance = 0.0, -1, 0.0
+    nowhere = np.int64(-1)
+    near, skip_mesh, skip_distance = 0.0, nowhere, 0.0
     first_patch, variants, patch, up = 0, 1, 0, 1.0
     lx, ly, lz, ix, iy = 0.0, 0.0, 0.0, np.int64(0), np.int64(0)
     m = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     inverse = m
     tinted, tint_r, tint_g, tint_b = False, 1.0, 1.0, 1.0
-    slab_mesh = np.int64(-1)
+    slab_mesh = nowhere
     first = True
     travelled = 0.0
     tx = ty = 0.0
@@ -209,7 +210,7 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                 macro, patches, material, tx, ty, gx, gy, gz, faces, frame, dx, dy, dz, t
             )
             if not in_slab:  # exactly edge-on: the cloth has no area here
-                near, skip_mesh, skip_distance = t * (1.0 + 1e-6) + 1e-9, np.int64(-1), 0.0
+                near, skip_mesh, skip_distance = t * (1.0 + 1e-6) + 1e-9, nowhere, 0.0
                 continue
             inverse = inverse_columns(m)
             slab_mesh = mesh
@@ -286,7 +287,7 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                 wox, woy, woz = _to_local(shading, -dx, -dy, -dz)
             nx, ny, nz = shading[6], shading[7], shading[8]
             surface = prepare_surface(packed, max(woz, 1e-4))
-            near, skip_mesh, skip_distance = 1e-6 * (1.0 + travelled), np.int64(-1), 0.0
+            near, skip_mesh, skip_distance = 1e-6 * (1.0 + travelled), nowhere, 0.0
             if first:
                 out[ALBEDO], out[ALBEDO + 1] = out[ALBEDO] + packed[0], out[ALBEDO + 1] + packed[1]
                 out[ALBEDO + 2] += packed[2]
@@ -317,7 +318,7 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                 weight = 1.0 if light_pdf == 0.0 else light_pdf / (light_pdf + pdf)
                 fr, fg, fb = beta_r * fr * weight, beta_g * fg * weight, beta_b * fb * weight
                 likely = max(fr, fg, fb) * SHADOW_ROULETTE
-                if likely < 1.0:
+                if likely < 1.0 and depth > 1:
                     stream, u0 = next_uniform(stream)
                     likely = 1.0 / likely if u0 < likely else 0.0
                 else:
@@ -345,9 +346,7 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                                 0.0, reach - start, slab_mesh, back + 2.0 * thickness,
                             )  # fmt: skip
                     else:
-                        share = transmittance(
-                            world, buffer, time, ox, oy, oz, wx, wy, wz, near, reach, np.int64(-1), 0.0
-                        )
+                        share = transmittance(world, buffer, time, ox, oy, oz, wx, wy, wz, near, reach, nowhere, 0.0)
                     cr, cg, cb = share * cr, share * cg, share * cb
                     total_r, total_g, total_b = total_r + cr, total_g + cg, total_b + cb
                     if depth == 1:

@@ -89,13 +89,13 @@ def _build(
     if here:
         # Triangles of meshes with copies keep their numbers: they are left without area, which Embree skips.
         triangles = np.zeros((int(first[-1]), 3), dtype=np.int64)
-        points, base = [np.zeros((keys, 1, 3))], 1
+        vertices, base = [np.zeros((keys, 1, 3))], 1
         for mesh, start in here:
             triangles[start : start + len(mesh.triangles)] = mesh.triangles + base
-            points.append(_points(mesh, keys))
-            clouds.append(_box(points[-1]))
+            vertices.append(_points(mesh, keys))
+            clouds.append(_box(vertices[-1]))
             base += len(mesh.points)
-        add_triangles(scene, np.concatenate(points, axis=1), triangles)
+        add_triangles(scene, np.concatenate(vertices, axis=1), triangles)
     cloud = np.concatenate(clouds)
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     margin = 1e-5 * float(np.abs(np.r_[low, high, high - low]).max()) + 1e-9

@@ -73,7 +73,8 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
         patch = generate_patch(fabric, copies=tile_copies(fabric))
     radius = min(s.radius for s in patch.systems)
     units = FIBER_RADIUS_UNITS / radius
-    vertices, first, flags, segments, yarns = [], [], [], [], []
+    vertices, first, flags, segments = [], [], [], []
+    yarns: list[NDArray] = []
     materials: list[NDArray] = []
     albedo: list[tuple[float, ...]] = []
     base = 0

@@ -148,5 +148,5 @@ def _mean(api: UsdGeom.PrimvarsAPI, name: str, fallback: Array, time: Usd.TimeCo
 
 
 def plain_material(path: str, color: Array | tuple[float, float, float], opacity: float = 1.0) -> Material:
-    """A matt surface of one colour."""
-    return Material(path, -1, np.asarray(color, dtype=np.float64), 0.5, 0.0, opacity)
+    """A matt surface of one colour, without a reflection (an index of 1)."""
+    return Material(path, -1, np.asarray(color, dtype=np.float64), 0.5, 0.0, opacity, ior=1.0)
