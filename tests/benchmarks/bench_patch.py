@@ -34,6 +34,7 @@ from bench_tracer import find_llvm
 from usdfab.fabric import FabricParameters, YarnParameters, weave_from_name
 from usdfab.fibers import generate_patch
 from usdfab.tracer import RenderSettings, Tracer
+from usdfab.tracer.patch_scene import tile_copies
 from usdfab.usd.rig import swatch_scene
 
 DEPTH = 32
@@ -41,8 +42,11 @@ TARGET = 0.01
 SIDE_M = 5e-3
 
 
-def sample(weave: str, fibers: int = 200) -> FabricParameters:
-    """The medians of Table 4; Mitsuba has one longitudinal roughness for all lobes, so gamma_M0 = gamma_M."""
+def sample(weave: str, fibers: int = 200, variants: int = 1) -> FabricParameters:
+    """The medians of Table 4; Mitsuba has one longitudinal roughness for all lobes, so gamma_M0 = gamma_M.
+
+    One variant of the tile, since Mitsuba gets copies of one.
+    """
     common = {
         "fiber_count": fibers, "irregularity": 0.15, "migration": 0.75, "twist": 0.03, "inclination": 0.8,
         "roughness_longitudinal": 0.45, "roughness_primary": 0.45, "roughness_azimuthal": 0.1,
@@ -58,7 +62,7 @@ def sample(weave: str, fibers: int = 200) -> FabricParameters:
         for n, r, c, f in zip(counts, radii, crimps, flattening, strict=True)
     )
     name = {"plain": "plain", "twill": "twill_1_3", "satin": "satin"}[weave]
-    return FabricParameters(weave_from_name(name), (SIDE_M, SIDE_M), warp, weft, name=weave)
+    return FabricParameters(weave_from_name(name), (SIDE_M, SIDE_M), warp, weft, name=weave, variants=variants)
 
 
 def noise(pictures: list) -> tuple[float, float]:
@@ -100,16 +104,15 @@ def mitsuba(weave: str, fibers: int, side: int, spp: int, runs: int) -> dict:
     mi.set_variant("llvm_ad_rgb" if llvm else "scalar_rgb")
     cloth = sample(weave, fibers)
     scene = swatch_scene(cloth)
-    cell = cloth.cell
-    picks, ends = cloth.repeat()
-    # Enough of the patch to cover the sample, and at least two cells around it, as far as light wanders.
-    margin = [-(-2 // ends), -(-2 // picks)]
-    repeat = np.array([ends * cell[0], picks * cell[1]])
-    copies = [int(np.ceil(s / r - 1e-6)) + 2 * m for s, r, m in zip(cloth.size, repeat, margin, strict=True)]
-    patch = generate_patch(cloth, copies=(copies[0], copies[1]))
+    # The same tile, and copies on all sides: enough to cover the sample and as far around it as light wanders.
+    patch = generate_patch(cloth, copies=tile_copies(cloth))
+    center = np.asarray(cloth.size) / 2
+    middle = np.mod(center, patch.size)
+    around = int(
+        np.ceil(max(center[k] + max(middle[k], patch.size[k] - middle[k]) for k in range(2)) / min(patch.size))
+    )
     with tempfile.TemporaryDirectory() as folder:
-        center = np.asarray(cloth.size) / 2 + np.asarray(margin) * repeat
-        files = mitsuba_scene.curves_text(patch, 0, center, Path(folder))
+        files = mitsuba_scene.curves_text(patch, around, middle, Path(folder))
         light = list(scene.lights)
         description = mitsuba_scene.mitsuba_dict(mi, cloth, files, scene.cameras[0], light, (side, side), DEPTH)
         loaded = mi.load_dict(description)

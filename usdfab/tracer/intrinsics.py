@@ -19,6 +19,10 @@ NG, U, V, PRIM, GEOM, INST = 12, 15, 16, 17, 18, 19
 # RTCIntersectArguments / RTCOccludedArguments, one with the back-face filter and one without (rtcore_common.h).
 ARGS_FILTER, ARGS_PLAIN = 24, 36
 WORDS = 48
+
+KERNEL: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "arcp"}}
+"""Options of kernels: divisions are not checked (what divides is guarded where it can be 0), and NaN and infinity keep
+their meaning."""
 _INVALID = np.uint32(0xFFFFFFFF)
 _INVOKE_ARGUMENT_FILTER = np.uint32(2)
 

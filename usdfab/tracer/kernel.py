@@ -31,7 +31,7 @@ from usdfab.scattering.fiber_numba import (
 from usdfab.scattering.surface_numba import PREPARED_SURFACE, eval_surface, prepare_surface, sample_surface
 from usdfab.tracer.counted import mix, next_uniform, start_stream
 from usdfab.tracer.film import ALBEDO, ALPHA, DEPTH, DIRECT, FIBER_ID, NORMAL, RAYS, SAMPLES, UV, YARN_ID
-from usdfab.tracer.intrinsics import NG, PRIM, U, borrow, new_ray_buffer
+from usdfab.tracer.intrinsics import KERNEL, NG, PRIM, U, borrow, new_ray_buffer
 from usdfab.tracer.lights import FAR, escaped_radiance, hit_light, light_blocks, sample_light
 from usdfab.tracer.slab import HIT, enter_slab, inverse_columns, leave_slab, slab_occluded, to_patch, trace_slab
 from usdfab.tracer.surfaces import MAX_SURFACES, surface_frame, trace_macro, transmittance
@@ -39,9 +39,9 @@ from usdfab.tracer.textures import lookup, normal_at, opacity_at, surface_at
 from usdfab.tracer.world import ALBEDO_MAP, FIRST_CURVE, FIRST_PATCH, FIRST_SEGMENT, borrowed
 
 RUSSIAN_ROULETTE_DEPTH = 5
-SHADOW_ROULETTE = 4.0 * math.pi
-"""From the second vertex on, light that would arrive with less than what isotropic scattering gives gets its shadow ray
-by chance only.
+SHADOW_ROULETTE = 2.0 * math.pi
+"""From the second vertex on, light that would arrive with less than half of what isotropic scattering gives gets its
+shadow ray by chance only.
 
 Fibers scatter into narrow lobes: at most vertices next to nothing goes towards a lamp, and the few that matter make the
 noise. So the rays that are saved here (nine of ten) cost hardly any variance.
@@ -53,7 +53,7 @@ _NO_SURFACE = (0.0,) * PREPARED_SURFACE
 """Of the right types, for variables that a fiber or a surface sets and nobody else reads."""
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def _shading_frame(nx, ny, nz, gx, gy, gz, hx, hy, hz, mapped, mx, my, mz):
     """Unit tangent, bitangent and normal for a surface: along the texture coordinates where a normal map needs it."""
     norm = 1.0 / math.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-300))
@@ -79,7 +79,7 @@ def _shading_frame(nx, ny, nz, gx, gy, gz, hx, hy, hz, mapped, mx, my, mz):
     return 1.0 + sign * nx * nx * a, sign * b, -sign * nx, b, sign + ny * ny * a, -ny, nx, ny, nz
 
 
-@njit(cache=True, inline="always")
+@njit(**KERNEL, forceinline=True)
 def _to_local(s, x, y, z):
     return (
         s[0] * x + s[1] * y + s[2] * z,
@@ -88,7 +88,7 @@ def _to_local(s, x, y, z):
     )
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def _tint_at(world, material, prim, u, v, tx, ty):
     """Factor of the fiber albedo from the mesh's colours and the fabric's albedo map: (r, g, b)."""
     r = g = b = 1.0
@@ -107,14 +107,14 @@ def _tint_at(world, material, prim, u, v, tx, ty):
     return r, g, b
 
 
-@njit(cache=True, inline="always")
+@njit(**KERNEL, forceinline=True)
 def _absorption(sigma, inverse_q, tint, albedo):
     """Absorption of a fiber whose albedo coefficient is multiplied by ``tint`` (Chiang et al. 2015; at most 1)."""
     root = math.sqrt(sigma) - math.log(min(max(tint, 1e-4), 1.0 / max(albedo, 1e-4))) * inverse_q
     return root * root if root > 0.0 else 0.0
 
 
-@njit(cache=True, inline="always")
+@njit(**KERNEL, forceinline=True)
 def _tinted(p, albedo, row, r, g, b):
     """The packed fiber material ``p`` with its albedo coefficient multiplied."""
     q = albedo[row, 3]
@@ -126,7 +126,7 @@ def _tinted(p, albedo, row, r, g, b):
     return absorption + p[3:]
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, set_ids, out):
     """Radiance along a camera ray. Adds to ``out``, the film's channels of the pixel."""
     macro, patches, lights = world.macro, world.patches, world.lights
@@ -387,7 +387,7 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
     return total_r, total_g, total_b
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def _camera_ray(view, time, s, t, u1, u2):
     """Start and direction of the ray through film position (s, t) in [-1, 1]^2, in the world."""
     x, y = view.film[0] * (s + view.film[2]), view.film[1] * (t + view.film[3])
@@ -417,7 +417,7 @@ def _camera_ray(view, time, s, t, u1, u2):
     return px, py, pz, dx * norm, dy * norm, dz * norm
 
 
-@njit(cache=True, nogil=True)
+@njit(**KERNEL, nogil=True)
 def render_tile(world, view, seed, window, first_sample, samples, max_depth, film, squares):
     """Add samples to the pixels of ``window`` (x0, y0, x1, y1).
 

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from usdfab.tracer.counted import mix
-from usdfab.tracer.intrinsics import ARGS_FILTER, TFAR, intersect, occluded
+from usdfab.tracer.intrinsics import ARGS_FILTER, KERNEL, TFAR, intersect, occluded
 from usdfab.tracer.lights import FAR
 from usdfab.tracer.world import EPSILON, FIRST_PATCH, HEIGHT, HIGH, LOW, UNITS, UV_SCALE, VARIANTS, WIDTH
 
@@ -27,7 +27,7 @@ MAX_TILES = 256
 ESCAPED_UP, ESCAPED_DOWN, HIT = 1, -1, 0
 
 
-@njit(cache=True, inline="always")
+@njit(**KERNEL, forceinline=True)
 def variant_at(first, count, ix, iy):
     """The patch that stands at tile (ix, iy): one of ``count`` from ``first`` on, by a hash."""
     if count <= 1:
@@ -36,7 +36,7 @@ def variant_at(first, count, ix, iy):
     return first + np.int64(mix(mix(key)) % np.uint64(count))
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def enter_slab(macro, patches, material, tx, ty, nx, ny, nz, faces, frame, dx, dy, dz, t):
     """The map from world to patch at a hit on a fabric, and where the ray enters the slab.
 
@@ -90,7 +90,7 @@ def enter_slab(macro, patches, material, tx, ty, nx, ny, nz, faces, frame, dx, d
     return ok, first, count, m, up, lx, ly, lz, np.int64(ix), np.int64(iy), back
 
 
-@njit(cache=True, inline="always")
+@njit(**KERNEL, forceinline=True)
 def to_patch(m, x, y, z):
     """A world vector in patch space, not normalised."""
     return (
@@ -100,7 +100,7 @@ def to_patch(m, x, y, z):
     )
 
 
-@njit(cache=True, inline="always")
+@njit(**KERNEL, forceinline=True)
 def inverse_columns(m):
     """Columns of the inverse of M, up to its determinant: images of the patch's axes in the world."""
     s = m[0] * (m[4] * m[8] - m[5] * m[7]) + m[1] * (m[5] * m[6] - m[3] * m[8]) + m[2] * (m[3] * m[7] - m[4] * m[6])
@@ -112,7 +112,7 @@ def inverse_columns(m):
     )  # fmt: skip
 
 
-@njit(cache=True, inline="always")
+@njit(**KERNEL, forceinline=True)
 def _step(width, height, low, high, lx, ly, lz, dx, dy, dz):
     """Distance to the border of the tile or slab, and which: 0 x, 1 y, 2 z."""
     t, axis = FAR, 2
@@ -132,7 +132,7 @@ def _step(width, height, low, high, lx, ly, lz, dx, dy, dz):
     return t, axis
 
 
-@njit(cache=True, forceinline=True)
+@njit(**KERNEL, forceinline=True)
 def trace_slab(trace, table, handles, buffer, first, count, lx, ly, lz, ix, iy, dx, dy, dz):
     """Nearest fiber along a ray in patch space.
 
@@ -166,7 +166,7 @@ def trace_slab(trace, table, handles, buffer, first, count, lx, ly, lz, ix, iy, 
     return (ESCAPED_UP if dz > 0.0 else ESCAPED_DOWN), total, lx, ly, lz, ix, iy, patch
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def slab_occluded(trace, table, handles, buffer, first, count, lx, ly, lz, ix, iy, dx, dy, dz, tmax):
     """Whether a fiber lies on a ray in patch space before it leaves the slab: (occluded, distance to the exit).
 
@@ -194,7 +194,7 @@ def slab_occluded(trace, table, handles, buffer, first, count, lx, ly, lz, ix, i
     return False, total
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def leave_slab(patches, first, up, pz):
     """How a ray that leaves a slab goes on: (world distance it steps back, thickness of the cloth in the world).
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from usdfab.tracer.intrinsics import ARGS_PLAIN, INST, PRIM, TFAR, U, V, intersect
+from usdfab.tracer.intrinsics import ARGS_PLAIN, INST, KERNEL, PRIM, TFAR, U, V, intersect
 from usdfab.tracer.slab import enter_slab, leave_slab, slab_occluded, to_patch
 from usdfab.tracer.textures import opacity_at
 from usdfab.tracer.world import FIRST_PATCH
@@ -16,7 +16,7 @@ MAX_SURFACES = 64
 """Layers of fabric or of transparent surface that a ray may pass."""
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def misses_all(macro, ox, oy, oz, dx, dy, dz, near, tmax):
     """Whether a ray stays outside of the bounds of all meshes: cheaper than asking Embree."""
     b = macro.bounds
@@ -34,7 +34,7 @@ def misses_all(macro, ox, oy, oz, dx, dy, dz, near, tmax):
     return low > high
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def trace_macro(world, buffer, time, ox, oy, oz, dx, dy, dz, near, tmax, skip_mesh, skip_distance):
     """Nearest triangle, those of ``skip_mesh`` nearer than ``skip_distance`` left out.
 
@@ -67,7 +67,7 @@ def trace_macro(world, buffer, time, ox, oy, oz, dx, dy, dz, near, tmax, skip_me
     return False, tmax, 0, -1, -1, 0.0, 0.0
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def surface_frame(macro, time, prim, copy, u, v):
     """What is interpolated at a hit, in the world.
 
@@ -147,7 +147,7 @@ def surface_frame(macro, time, prim, copy, u, v):
     return tx, ty, e0 * norm, e1 * norm, e2 * norm, (n0, n1, n2, g0, g1, g2, h0, h1, h2)
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def transmittance(world, buffer, time, ox, oy, oz, dx, dy, dz, near, tmax, skip_mesh, skip_distance):
     """Share of the light from distance ``tmax`` that comes through: surfaces stop it, fabrics where a fiber is."""
     macro = world.macro

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from usdfab.tracer.intrinsics import borrow
+from usdfab.tracer.intrinsics import KERNEL, borrow
 from usdfab.tracer.lights import Lights
 from usdfab.tracer.textures import Materials, Textures
 
@@ -132,7 +132,7 @@ class View(NamedTuple):
     moves: bool
 
 
-@njit(cache=True)
+@njit(**KERNEL)
 def borrowed(world):
     """The world with arrays that are not reference-counted (see ``intrinsics.borrow``)."""
     m, p, s, t, li = world.macro, world.patches, world.materials, world.textures, world.lights
