@@ -15,7 +15,7 @@ from usdfab.usd.fabric_io import define_fabric_material
 
 CELL = 0.02
 """Side in metres of the squares of cloth; the picture shows 3 x 2 of them."""
-RED, BLUE = (0.8, 0.15, 0.15), (0.15, 0.2, 0.85)
+RED, BLUE = (0.8, 0.03, 0.03), (0.03, 0.05, 0.8)
 HEIGHT = 0.3
 LIGHTS = ("DistantLight", "SphereLight", "point", "DiskLight", "RectLight", "CylinderLight", "DomeLight")
 
@@ -95,12 +95,13 @@ class Builder:
         return camera
 
     def light(self, kind: str, path: str | None = None):
-        """One light of a kind, above the stage and shining down, of about the same brightness as the others."""
+        """One light of a kind, beside the picture and shining down, of about the same brightness as the others."""
         path = path or f"/World/Light_{kind}"
         light = getattr(UsdLux, "SphereLight" if kind == "point" else kind).Define(self.stage, path)
         turn = UsdGeom.Xformable(light)
         if kind not in ("DomeLight", "DistantLight"):
-            turn.AddTranslateOp().Set(self.point((0.02, 0.01, 0.15)))
+            angle = 0.4 * np.pi * LIGHTS.index(kind)  # lights hide one another: each has a place of its own
+            turn.AddTranslateOp().Set(self.point((0.09 * np.cos(angle), 0.09 * np.sin(angle), 0.15)))
         if self.up == "Y":
             turn.AddRotateXOp().Set(-90.0)  # UsdLux shines along -z, which is then down
         size = 0.04 / self.meters
@@ -110,7 +111,7 @@ class Builder:
                 attribute.Set(0.25 * size if kind in ("CylinderLight", "point") and name == "radius" else size)
         if kind == "point":
             light.CreateTreatAsPointAttr(True)
-        intensity = {"DomeLight": 0.5, "DistantLight": 5.0, "SphereLight": 3.0, "point": 60.0}.get(kind, 12.0)
+        intensity = {"DomeLight": 0.5, "DistantLight": 5.0, "point": 400.0, "DiskLight": 40.0}.get(kind, 100.0)
         light.CreateIntensityAttr(intensity)
         if kind == "DistantLight":
             light.CreateAngleAttr(3.0)
@@ -166,7 +167,7 @@ def showroom(
     texture: Path, lights: Sequence[str] = ("DomeLight",), change: Callable[[Builder], None] | None = None, **options
 ) -> Builder:
     """Six cells: bottom, a red fabric; red and blue on GeomSubsets; a textured surface. Top: displayColor; four copies
-    of a red cloth by a point instancer; a blue fabric on a refined cage without texture coordinates.
+    of a red cloth by a point instancer; a blue fabric on a cube refined to a ball, without texture coordinates.
 
     Sheets that are not to be seen hang above it all.
     """
@@ -195,7 +196,16 @@ def showroom(
     instancer.CreatePositionsAttr([Gf.Vec3f(b.point(p)) for p in places])
     instancer.CreateProtoIndicesAttr([0, 0, 0, 0])
 
-    cage = b.sheet("/World/Cage", (*cell(2, 1), 0), parts=3, uv=None, scheme="catmullClark")
+    x, y = cell(2, 1)
+    half = 0.45 * CELL
+    cube = [
+        (x + half * (2 * i - 1), y + half * (2 * j - 1), half * (2 * k - 1))
+        for k in (0, 1)
+        for j in (0, 1)
+        for i in (0, 1)
+    ]
+    faces = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
+    cage = b.mesh("/World/Cage", cube, faces, scheme="catmullClark")
     b.bind(cage, blue)
 
     for name in ("Invisible", "Proxy", "Guide"):

