@@ -208,6 +208,13 @@ def _broken_dome(b: Builder) -> str:
     return str(broken)
 
 
+def _second_dome(b: Builder) -> str:
+    image = UsdShade.Shader(b.stage.GetPrimAtPath("/World/Looks/Paint/Image")).GetInput("file").Get().path
+    for path in ("/World/Sky1", "/World/Sky2"):
+        b.light("DomeLight", path).CreateTextureFileAttr(image)
+    return "/World/Sky2"
+
+
 def _zero_area_light(b: Builder) -> str:
     b.light("RectLight", "/World/Zero").CreateWidthAttr(0.0)
     return "/World/Zero"
@@ -233,7 +240,7 @@ def _bad_fabric(b: Builder) -> str:
     return "/World/Looks/Red"
 
 
-FAULTS = [_missing_texture, _broken_texture, _broken_dome, _zero_area_light]
+FAULTS = [_missing_texture, _broken_texture, _broken_dome, _second_dome, _zero_area_light]
 FAULTS += [_nan_transform, _no_area, _bad_index, _bad_fabric]
 
 

@@ -65,7 +65,8 @@ def read_textures(scene: Scene, strict: bool = False) -> tuple[Scene, dict]:
     Returns
     -------
     scene:
-        Without the dome lights whose picture cannot be read: its ``warnings`` name them.
+        Without the dome lights whose picture cannot be read, or that come after another with a picture: its
+        ``warnings`` name them.
 
     Raises
     ------
@@ -78,6 +79,9 @@ def read_textures(scene: Scene, strict: bool = False) -> tuple[Scene, dict]:
     found, lights, warnings = {}, [], list(scene.warnings)
     for light in scene.lights:
         path = light.texture_path if isinstance(light, DomeLight) else ""
+        if path and found and not strict:
+            warnings.append(f"{light.path}: a second dome light with a texture is not supported, left out")
+            continue
         if path and path not in found:
             try:
                 found[path] = read_image(path).pixels
