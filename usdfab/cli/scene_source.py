@@ -76,7 +76,8 @@ def read_textures(scene: Scene, strict: bool = False) -> tuple[Scene, dict]:
     from usdfab.imaging import read_image
     from usdfab.usd.scene import DomeLight
 
-    found, lights, warnings = {}, [], list(scene.warnings)
+    found: dict = {}
+    lights, warnings = [], list(scene.warnings)
     for light in scene.lights:
         path = light.texture_path if isinstance(light, DomeLight) else ""
         if path and found and not strict:
