@@ -185,7 +185,8 @@ def test_exposure_and_view_change_the_png_only(run, tiny: Path, whole: Path, tmp
     [
         (["--region", "0,0,99,99"], "--region"),
         (["--region", "a"], "--region"),
-        (["--frames", "9-1"], "--frames"),
+        (["--frames", "9-x"], "--frames"),
+        (["--frames", "all"], "--frames"),
         (["--frames", "1-2", "--time-code", "3"], "--time-code"),
         (["--frames", "1-2", "--checkpoint", "x"], "--checkpoint"),
         (["--aov", "depth"], "--aov"),

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 from hypothesis import given, strategies as st
+from pxr import Usd
 
-from usdfab.cli.options import frame_path, parse_frames, parse_region, parse_tile
+from usdfab.cli.options import frame_path, parse_region, parse_tile
 from usdfab.cli.picture import picture_options
 from usdfab.cli.render_files import part_path, plan_files
+from usdfab.cli.scene_source import frame_numbers
 from usdfab.errors import UsdfabError
 from usdfab.tracer.aovs import AOVS, parse_aovs
 
@@ -35,30 +37,29 @@ def test_what_is_no_region(text):
         parse_region(text)
 
 
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory):
+    """A file whose time codes run from 3 to 5."""
+    path = tmp_path_factory.mktemp("frames") / "stage.usda"
+    made = Usd.Stage.CreateNew(str(path))
+    made.SetStartTimeCode(3)
+    made.SetEndTimeCode(5)
+    made.Save()
+    return path
+
+
 @pytest.mark.parametrize(
     ("text", "frames"),
-    [
-        ("7", [7]),
-        ("1-4", [1, 2, 3, 4]),
-        ("1-10x4", [1, 5, 9]),
-        ("-2-1", [-2, -1, 0, 1]),
-        ("-3--1", [-3, -2, -1]),
-        ("1-3, 2-5x3,9", [1, 2, 3, 5, 9]),
-    ],
+    [("7", [7]), ("1-10x4", [1, 5, 9]), ("all", [3, 4, 5]), ("1-3, 2-5x3,9", [1, 2, 3, 5, 9]), ("5-4", [5, 4])],
 )
-def test_frames(text, frames):
-    assert parse_frames(text) == frames
+def test_frames(stage, text, frames):
+    assert frame_numbers(stage, text) == frames
 
 
-@pytest.mark.parametrize("text", ["", "a", "1-", "5-1", "1-5x0", "1-5x", "1.5", "1-9999999", "1,,2"])
-def test_what_is_no_frames(text):
+@pytest.mark.parametrize("text", ["", "a", "1-", "1-5x0", "1-5x", "1-9999999", "1,,2"])
+def test_what_is_no_frames(stage, text):
     with pytest.raises(UsdfabError, match="--frames"):
-        parse_frames(text)
-
-
-@given(st.integers(0, 10**4), st.integers(0, 10**4), st.integers(1, 99))
-def test_frames_are_a_range(first, more, step):
-    assert parse_frames(f"{first}-{first + more}x{step}") == list(range(first, first + more + 1, step))
+        frame_numbers(stage, text)
 
 
 @pytest.mark.parametrize(
@@ -70,6 +71,9 @@ def test_frames_are_a_range(first, more, step):
         ("out.%04d.exr", 3, "out.0003.exr"),
         ("out.%d.exr", 3, "out.3.exr"),
         ("out.####.exr", -5, "out.-0005.exr"),
+        ("out.####.exr", 7.25, "out.0007.25.exr"),
+        ("out.####.exr", -0.5, "out.-0000.5.exr"),
+        ("out.%03d.exr", 20.0, "out.020.exr"),
     ],
 )
 def test_frame_names(pattern, frame, name):

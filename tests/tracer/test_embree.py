@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import gc
 import math
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -167,3 +170,24 @@ def test_hits_on_a_patch_lie_on_their_fiber(fibers):
     cosine /= np.linalg.norm(outward, axis=1) * np.linalg.norm(hit.normal[some], axis=1)
     assert cosine.min() > 0.99
     assert np.all(np.einsum("kx,kx->k", directions[some], hit.normal[some]) <= 0)
+
+
+def test_threads_that_start_together_share_one_device():
+    """Two devices would leave scenes silently empty: geometry of one does not show in a scene of the other."""
+    made = []
+
+    def slow() -> object:
+        time.sleep(0.02)
+        made.append(object())
+        return made[-1]
+
+    shared, barrier = embree._once(slow), threading.Barrier(4)
+
+    def ask(_: int) -> object:
+        barrier.wait()
+        return shared()
+
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(ask, range(4)))
+    assert len(made) == 1 and all(f is made[0] for f in found)
+    assert all(hasattr(f, "__wrapped__") for f in (embree.library, embree.device, embree.function_addresses))

@@ -17,7 +17,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from usdfab.cli.scene_source import SceneSource, read_textures
+from usdfab.cli.scene_source import SceneSource, read_textures, scene_fingerprint
 from usdfab.errors import UsdfabError
 
 if TYPE_CHECKING:
@@ -62,26 +62,25 @@ def _tracer(source: SceneSource, wanted: str) -> Tracer:
     """The tracer of a scene, from the last call if it is the same scene. Only one is kept: scenes are large."""
     global _kept
     from usdfab.tracer import Tracer
-    from usdfab.tracer.checkpoint import fingerprint
 
     with _lock:  # a worker's threads ask at the same time
         if _kept is None or _kept[0] != wanted:
             _kept = None
-            scene, _ = source.read()
-            textures = read_textures(scene)
-            if fingerprint(scene, textures) != wanted:
+            scene, textures = read_textures(source.read()[0], source.strict)
+            if scene_fingerprint(scene, textures) != wanted:
                 raise UsdfabError(
                     "a worker reads another scene here than this process does",
                     place=source.stage,
                     remedy="let all machines see the same files and run the same version of usdfab",
                 )
-            _kept = (wanted, Tracer(scene, textures))
+            _kept = (wanted, Tracer(scene, textures, source.strict))
         return _kept[1]
 
 
-def segments_task(source: SceneSource, fingerprint: str) -> int:
-    """Fiber segments of a scene's patches; raises early what any tile would raise."""
-    return _tracer(source, fingerprint).segments
+def tracer_task(source: SceneSource, fingerprint: str) -> tuple[int, tuple[str, ...]]:
+    """Fiber segments of a scene's patches and the tracer's warnings; raises early what any tile would raise."""
+    tracer = _tracer(source, fingerprint)
+    return tracer.segments, tracer.warnings
 
 
 class ExecutorRunner:
@@ -115,9 +114,10 @@ class ExecutorRunner:
                 remedy="look at the workers' logs; --resume goes on from here",
             ) from error
 
-    def segments(self) -> int:
-        """Fiber segments that a worker found."""
-        return int(self._told(self._executor.submit(segments_task, self._source, self._fingerprint)))
+    def about(self) -> tuple[int, tuple[str, ...]]:
+        """Fiber segments that a worker found, and its tracer's warnings."""
+        segments, warnings = self._told(self._executor.submit(tracer_task, self._source, self._fingerprint))
+        return int(segments), tuple(warnings)
 
     def stop(self) -> None:
         for future in self._futures:

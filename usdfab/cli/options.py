@@ -98,27 +98,15 @@ def parse_region(text: str | None) -> Region | None:
     return Region((a, b, c, d), (p, q, r, s))
 
 
-MAX_FRAMES = 1_000_000
+def frame_path(pattern: Path, frame: float) -> Path:
+    """A frame's file: ``out.####.exr`` and ``out.%04d.exr`` are filled in, ``out.exr`` becomes ``out.0007.exr``.
 
-
-def parse_frames(text: str) -> list[int]:
-    """Whole time codes from ``1-10``, ``1-10x2`` (every second), ``7`` or several of these with commas between."""
-    frames: dict[int, None] = {}
-    for part in text.split(","):
-        match = re.fullmatch(r"\s*(-?\d+)(?:-(-?\d+)(?:x(\d+))?)?\s*", part)
-        first, last, step = (match[1], match[2] or match[1], match[3] or 1) if match else (0, -1, 1)
-        numbers = range(int(first), int(last) + 1, max(1, int(step)))
-        if not numbers or int(step) < 1 or len(numbers) > MAX_FRAMES:
-            raise UsdfabError(f"'{text}' names no frames", place="--frames", remedy="write e.g. 1-24, 1-24x2 or 1,5,9")
-        frames.update(dict.fromkeys(numbers))
-    return list(frames)
-
-
-def frame_path(pattern: Path, frame: int) -> Path:
-    """A frame's file: ``out.####.exr`` and ``out.%04d.exr`` are filled in, ``out.exr`` becomes ``out.0007.exr``."""
+    Between whole frames the decimals follow: ``out.0007.5.exr``.
+    """
+    whole, _, decimals = f"{abs(frame):.9f}".rstrip("0").partition(".")
 
     def digits(width: int) -> str:
-        return f"{'-' if frame < 0 else ''}{abs(frame):0{width}d}"
+        return f"{'-' if frame < 0 else ''}{whole.zfill(width)}{'.' if decimals else ''}{decimals}"
 
     name, count = re.subn(r"#+", lambda m: digits(len(m[0])), pattern.name)
     if not count:

@@ -21,7 +21,6 @@ from usdfab.cli.options import (
     Threads,
     View,
     frame_path,
-    parse_frames,
     parse_region,
     parse_resolution,
     parse_tile,
@@ -49,7 +48,7 @@ def run(
     max_depth: Annotated[int, Parameter(help="Longest path; 2 is direct light only.")] = 64,
     time_code: Annotated[float | None, Parameter(help="Time code of the stage to render.")] = None,
     frames: Annotated[
-        str | None, Parameter(help="Time codes A-B or A-BxSTEP, one file each: out.####.exr or out.%04d.exr.")
+        str | None, Parameter(help="Time codes 1-10, 1-10x2, 1,5,9 or all; one file each: out.####.exr.")
     ] = None,
     aov: Aov = None,
     exposure: Exposure = None,
@@ -68,6 +67,9 @@ def run(
     scheduler: Annotated[
         str | None, Parameter(help="Dask scheduler tcp://HOST:PORT whose workers render, or local for processes here.")
     ] = None,
+    strict: Annotated[
+        bool, Parameter(negative="", help="Stop at whatever is wrong with the stage instead of leaving it out.")
+    ] = False,
     seed: Seed = 0,
     threads: Threads = None,
     overwrite: Overwrite = False,
@@ -93,7 +95,7 @@ def run(
     """
     from usdfab.cli.picture import picture_options
     from usdfab.cli.render_files import RenderFile, plan_files
-    from usdfab.cli.scene_source import SceneSource
+    from usdfab.cli.scene_source import SceneSource, frame_numbers
     from usdfab.errors import UsdfabError
 
     target = output or Path(stage.stem + ".png")
@@ -101,15 +103,15 @@ def run(
     part = parse_tile(tile)
     window = parse_region(region)
     size = parse_resolution(resolution)
-    numbers = parse_frames(frames) if frames is not None else None
     if not 0 <= seed < 2**63:
         raise UsdfabError(f"{seed} is not between 0 and 2^63 - 1", place="--seed")
     if workers is not None and (workers < 1 or scheduler not in (None, "local")):
         raise UsdfabError("--workers is a number of processes here, 1 or more", place="--workers")
-    if numbers is not None and (time_code is not None or checkpoint is not None):
+    if frames is not None and (time_code is not None or checkpoint is not None):
         other = "--time-code" if time_code is not None else "--checkpoint"
         raise UsdfabError(f"does not go with {other}", place="--frames")
-    pictures = [(target, time_code)] if numbers is None else [(frame_path(target, n), float(n)) for n in numbers]
+    numbers = frame_numbers(stage, frames) if frames is not None else None
+    pictures = [(target, time_code)] if numbers is None else [(frame_path(target, n), n) for n in numbers]
     files = plan_files(pictures, part, checkpoint, resume, overwrite)
 
     from usdfab.cli.cluster import dask_executor
@@ -121,7 +123,7 @@ def run(
     names = {name: str(path.absolute()) if path is not None else None for name, path in texts.items()}
 
     def source(file: RenderFile) -> SceneSource:
-        return SceneSource(str(stage.absolute()), names["fabric"], names["rig"], camera, file.time_code)
+        return SceneSource(str(stage.absolute()), names["fabric"], names["rig"], camera, file.time_code, strict)
 
     results, warnings, worn = [], [], None
     place = "local" if scheduler is None and workers is not None else scheduler

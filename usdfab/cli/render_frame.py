@@ -15,11 +15,11 @@ from usdfab.cli.cluster import ExecutorRunner
 from usdfab.cli.options import Region, progress_bar, say
 from usdfab.cli.picture import PictureOptions, render_facts, render_line, write_picture
 from usdfab.cli.render_files import RenderFile
-from usdfab.cli.scene_source import SceneSource, read_textures
+from usdfab.cli.scene_source import SceneSource, read_textures, scene_fingerprint
 from usdfab.errors import UsdfabError
 from usdfab.tracer import Tracer
 from usdfab.tracer.accumulate import Runner, ThreadRunner, accumulate
-from usdfab.tracer.checkpoint import Autosave, Identity, fingerprint, resume_work, save_work
+from usdfab.tracer.checkpoint import Autosave, Identity, resume_work, save_work
 from usdfab.tracer.film import RAYS
 from usdfab.tracer.render import RenderSettings, Shot, develop, resolve_resolution, start
 from usdfab.tracer.schedule import Work
@@ -53,28 +53,30 @@ def render_frame(
             say(f"{file.output} is there already")
         return {"output": file.output, "skipped": True}, [], None
     scene, override = source.read()
-    warnings = list(scene.warnings)
+    scene, textures = read_textures(scene, source.strict)
+    warnings: list[str] = []
 
-    def warn(text: str) -> None:
+    def warn(text: str, *, always: bool = False) -> None:
         warnings.append(text)
-        say(f"warning: {text}")
+        if always or not options.quiet:
+            say(f"warning: {text}")
 
-    if not options.quiet:
-        for warning in scene.warnings:
-            say(f"warning: {warning}")
+    for warning in scene.warnings:
+        warn(warning)
     if not scene.cameras:
         raise UsdfabError("the stage has no camera", place=source.stage, remedy="add a UsdGeomCamera")
     camera, settings = scene.cameras[0], options.settings
     if options.region is not None:
         settings = replace(settings, region=options.region.pixels(*resolve_resolution(camera, settings.resolution)))
     shot, work = start(camera, settings)
-    facts = _render(source, scene, shot, work, settings, file, options, remote, warn)
+    facts = _render(source, scene, textures, shot, work, settings, file, options, remote, warn)
     return facts, warnings, override.name if override else None
 
 
 def _render(
     source: SceneSource,
     scene: Scene,
+    textures: dict,
     shot: Shot,
     work: Work,
     settings: RenderSettings,
@@ -83,9 +85,10 @@ def _render(
     remote: Remote,
     warn: Any,
 ) -> Facts:
-    textures = read_textures(scene)
-    print_of_scene = fingerprint(scene, textures)
-    with _runner(source, scene, textures, print_of_scene, shot, settings, remote) as (runner, segments):
+    print_of_scene = scene_fingerprint(scene, textures)
+    with _runner(source, scene, textures, print_of_scene, shot, settings, remote) as (runner, segments, said):
+        for warning in said:
+            warn(warning)
         identity = Identity.of(print_of_scene, shot, settings, segments)
         before = 0.0
         if options.resume and file.partial.exists():
@@ -93,7 +96,7 @@ def _render(
             work, before = saved.work, saved.seconds
         else:
             file.partial.unlink(missing_ok=True)  # --overwrite: it is not to be taken for this one
-        autosave = Autosave(file.partial, identity, settings.spp, warn, before)
+        autosave = Autosave(file.partial, identity, settings.spp, partial(warn, always=True), before)
         try:
             with progress_bar(options.label, quiet=options.quiet) as update:
                 seconds = before + accumulate(
@@ -127,16 +130,16 @@ def _render(
 @contextmanager
 def _runner(
     source: SceneSource, scene: Scene, textures: dict, wanted: str, shot: Shot, settings: RenderSettings, remote: Remote
-) -> Iterator[tuple[Runner, int]]:
-    """Who samples tiles, and how many fiber segments the scene has."""
+) -> Iterator[tuple[Runner, int, tuple[str, ...]]]:
+    """Who samples tiles, how many fiber segments the scene has, and the tracer's warnings."""
     if remote is not None:
         executor, slots = remote
         elsewhere = ExecutorRunner(executor, slots, source, wanted, shot)
-        yield elsewhere, elsewhere.segments()
+        yield elsewhere, *elsewhere.about()
         return
-    tracer = Tracer(scene, textures)
+    tracer = Tracer(scene, textures, source.strict)
     with ThreadRunner(partial(tracer.sample, shot), settings.threads or 1) as here:
-        yield here, tracer.segments
+        yield here, tracer.segments, tracer.warnings
 
 
 def _write(

@@ -10,9 +10,12 @@ from __future__ import annotations
 import ctypes
 import importlib.util
 import sys
+import threading
 import weakref
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, wraps
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +41,25 @@ _PADDING = 16
 """Bytes that Embree may read past the last vertex of a shared buffer."""
 
 
+T = TypeVar("T")
+_lock = threading.RLock()
+
+
+def _once(function: Callable[[], T]) -> Callable[[], T]:
+    """The function's first result for ever, also where threads ask at the same time.
+
+    ``lru_cache`` alone may then call it twice, and a geometry of one device in a scene of another is silently empty.
+    """
+    cached = lru_cache(maxsize=1)(function)
+
+    @wraps(function)
+    def locked() -> T:
+        with _lock:
+            return cached()
+
+    return locked
+
+
 def _library_path() -> Path:
     spec = importlib.util.find_spec("embreex")
     if spec is None or spec.origin is None:
@@ -55,7 +77,7 @@ def _library_path() -> Path:
     )
 
 
-@lru_cache(maxsize=1)
+@_once
 def library() -> ctypes.CDLL:
     """The loaded Embree library, with argument types declared."""
     path = _library_path()
@@ -92,7 +114,7 @@ def library() -> ctypes.CDLL:
     return lib
 
 
-@lru_cache(maxsize=1)
+@_once
 def device() -> int:
     """The one Embree device of this process."""
     lib = library()
@@ -112,7 +134,7 @@ def version() -> str:
     return f"{number // 10000}.{number // 100 % 100}.{number % 100}"
 
 
-@lru_cache(maxsize=1)
+@_once
 def function_addresses() -> tuple[int, int]:
     """Addresses of ``rtcIntersect1`` and ``rtcOccluded1`` for compiled kernels."""
     lib = library()

@@ -7,14 +7,16 @@ UsdUVTexture <- UsdTransform2d (any number) <- UsdPrimvarReader_float2.
 from __future__ import annotations
 
 import math
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 from pxr import Usd, UsdShade
 
 from usdfab.errors import UsdfabError
+from usdfab.fabric import FabricParameters
 from usdfab.usd.assets import image_file
+from usdfab.usd.problems import Problems
 from usdfab.usd.scene import Array, Texture
 
 LINEAR_SUFFIXES = (".exr", ".hdr")
@@ -28,6 +30,17 @@ _MAX_CHAIN = 32
 def albedo_texture(file: str) -> Texture:
     """A colour image that repeats over uv, linear for ``LINEAR_SUFFIXES``, else sRGB."""
     return Texture(file, "rgb", ("repeat", "repeat"), _is_linear(file, True), np.ones(4), np.zeros(4), _identity())
+
+
+def albedo_map(fabric: FabricParameters, path: str, problems: Problems) -> Texture | None:
+    """A fabric's albedo map, over one unit of uv; a file that does not exist is a fault of the prim at ``path``."""
+    if not fabric.albedo_map:
+        return None
+    if not Path(fabric.albedo_map).is_file():
+        problem = f"the albedo map {fabric.albedo_map} does not exist"
+        problems.fault(UsdfabError(problem, place=path), "the cloth has its yarns' colours")
+        return None
+    return albedo_texture(fabric.albedo_map)
 
 
 def read_texture(

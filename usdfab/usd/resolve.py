@@ -7,7 +7,6 @@ with placements; fewer are meshes of their own.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade
@@ -22,8 +21,8 @@ from usdfab.usd.primvars import ALBEDO, Values
 from usdfab.usd.problems import Problems
 from usdfab.usd.read_materials import Look, plain_material, read_material, unbound_material
 from usdfab.usd.read_mesh import Bindings, Cage, read_bindings, read_cage
-from usdfab.usd.read_textures import albedo_texture
-from usdfab.usd.scene import Array, FabricSurface, Material, Mesh, Texture
+from usdfab.usd.read_textures import albedo_map
+from usdfab.usd.scene import Array, FabricSurface, Material, Mesh
 from usdfab.usd.stage import site, stage_name
 from usdfab.usd.tessellate import Triangles, levels, tessellate
 from usdfab.usd.unwrap import unwrap_faces
@@ -292,7 +291,9 @@ class Resolver:
             with self.problems.tolerating(str(prim.GetPath()), "metres per uv are measured"):
                 meters = meters_per_uv_from_prim(prim)
         path = str(prim.GetPath()) if prim else shape.path
-        surface = FabricSurface(path, fabric, meters or self._measured(shape, baked, faces), self._map(fabric, path))
+        surface = FabricSurface(
+            path, fabric, meters or self._measured(shape, baked, faces), albedo_map(fabric, path, self.problems)
+        )
         self.fabrics.append(surface)
         if prim is not None and UsdShade.Material(prim):
             look = self._look(prim).material
@@ -311,16 +312,6 @@ class Resolver:
         if not (area > 0 and uv_area > 0):
             raise UsdfabError("the cloth has no area", place=site(self.stage, shape.prim))
         return float(np.sqrt(area / uv_area))
-
-    def _map(self, fabric: FabricParameters, path: str) -> Texture | None:
-        """The fabric's albedo map; a file that does not exist is a fault."""
-        if not fabric.albedo_map:
-            return None
-        if not Path(fabric.albedo_map).is_file():
-            problem = f"the albedo map {fabric.albedo_map} does not exist"
-            self.problems.fault(UsdfabError(problem, place=path), "the cloth has its yarns' colours")
-            return None
-        return albedo_texture(fabric.albedo_map)
 
 
 def _uv_area(uv: Array) -> float:

@@ -20,7 +20,9 @@ from usdfab.fabric import FabricParameters
 from usdfab.fabric.fabric import SIZE_RANGE
 from usdfab.usd.atomic import checked_output, export_layer
 from usdfab.usd.fabric_io import preview_color, preview_roughness
+from usdfab.usd.problems import Problems
 from usdfab.usd.read_scene import read_scene
+from usdfab.usd.read_textures import albedo_map
 from usdfab.usd.scene import Camera, FabricSurface, Material, Mesh, PointLight, Scene
 from usdfab.usd.stage import new_stage, open_stage
 
@@ -177,18 +179,22 @@ def _define_plane(stage: Usd.Stage, path: Sdf.Path, rig: Rig) -> None:
     st.Set([Gf.Vec2f(*map(float, c)) for c in uv])
 
 
-def swatch_scene(fabric: FabricParameters, rig: str | Path | Usd.Stage | Rig | None = None) -> Scene:
+def swatch_scene(
+    fabric: FabricParameters, rig: str | Path | Usd.Stage | Rig | None = None, *, strict: bool = False
+) -> Scene:
     """A flat sample of ``fabric`` under the capture rig, as ``usdfab render fabric.usda`` and the fit show it.
 
     The picture shows the rectangle (0, 0) to ``fabric.size`` of the cloth, exactly at z = 0, on a plane
     ``PLANE_FACTOR`` times as large. A white diffuse sample has pixel value 1 in the middle
-    (``Rig.light_intensity``).
+    (``Rig.light_intensity``). An albedo map covers the fabric's size once and repeats.
 
     Parameters
     ----------
     rig:
         None: the paper's rig for the fabric's size. A ``Rig``: its distances and its sample size. A file or stage:
         its cameras, lights and plane as they are; the cloth goes on the plane by ``read_scene``'s rule.
+    strict:
+        As ``read_scene``; a missing albedo map is an error then.
 
     Raises
     ------
@@ -196,18 +202,19 @@ def swatch_scene(fabric: FabricParameters, rig: str | Path | Usd.Stage | Rig | N
         As ``read_scene`` for a rig file; also if it holds no camera or no light.
     """
     if rig is None:
-        return _swatch(fabric, rig_for(fabric.size))
+        return _swatch(fabric, rig_for(fabric.size), strict)
     if isinstance(rig, Rig):
-        return _swatch(fabric, rig)
+        return _swatch(fabric, rig, strict)
     stage = open_stage(rig)
-    scene = read_scene(stage, fabric_override=fabric)
+    scene = read_scene(stage, fabric_override=fabric, strict=strict)
     for kind, found in (("camera", scene.cameras), ("light", scene.lights)):
         if not found:
             raise UsdfabError(f"the rig has no {kind}", place=scene.path, remedy="write one with `write_rig` and edit")
-    return scene
+    return replace(scene, fabrics=tuple(_map_over_sample(surface) for surface in scene.fabrics))
 
 
-def _swatch(fabric: FabricParameters, rig: Rig) -> Scene:
+def _swatch(fabric: FabricParameters, rig: Rig, strict: bool) -> Scene:
+    problems = Problems(strict=strict)
     points, uv = _plane(rig)
     triangles = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
     normals = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (2, 3, 3))
@@ -217,5 +224,14 @@ def _swatch(fabric: FabricParameters, rig: Rig) -> Scene:
     camera = Camera(f"{RIG_PATH}/Camera", to_world, np.asarray(rig.tan_half), np.zeros(2), 0.0)
     light = PointLight(f"{RIG_PATH}/Lamp", np.asarray(rig.light_position), np.full(3, rig.light_intensity))
     look = Material(f"{RIG_PATH}/Fabric", 0, np.asarray(preview_color(fabric)), preview_roughness(fabric), 0.0, 1.0)
-    surface = FabricSurface(look.path, fabric, 1.0)
-    return Scene("swatch", (mesh,), (look,), (surface,), (camera,), (light,), (), "Z")
+    surface = _map_over_sample(FabricSurface(look.path, fabric, 1.0, albedo_map(fabric, look.path, problems)))
+    return Scene("swatch", (mesh,), (look,), (surface,), (camera,), (light,), tuple(problems.warnings), "Z")
+
+
+def _map_over_sample(surface: FabricSurface) -> FabricSurface:
+    """The surface with its albedo map, if any, over ``fabric.size`` of cloth instead of over one unit of uv."""
+    if surface.albedo_map is None:
+        return surface
+    transform = surface.albedo_map.uv_transform.copy()
+    transform[:, :2] *= surface.meters_per_uv / np.asarray(surface.fabric.size)
+    return replace(surface, albedo_map=replace(surface.albedo_map, uv_transform=transform))
