@@ -2,9 +2,9 @@
 
     python tests/benchmarks/bench_build.py [--smoke] [--weaves plain,twill,satin] [--runs 5]
 
-``patch`` is one repeat of the weave, ``tiles`` all variants of the fabric's tile, as the tracer uses them. ``fibers`` are
-vertices, indices and records; ``hierarchy`` is what Embree asks its device for while it builds, less what it gives back
-(its own memory monitor). Seconds are medians. One line of JSON for each weave.
+``patch`` is one repeat of the weave, ``tiles`` all variants of the fabric's tile, as the tracer uses them. ``fibers``
+are vertices, indices and records; ``hierarchy`` is what Embree asks its device for while it builds, less what it gives
+back (its own memory monitor). Seconds are medians. One line of JSON for each weave.
 """
 
 from __future__ import annotations
