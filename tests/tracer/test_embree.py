@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import math
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +31,23 @@ from usdfab.tracer.intrinsics import (
     new_ray_buffer,
     occluded,
 )
+
+
+def test_threads_that_come_first_share_one_device():
+    program = """
+import sys, threading
+from concurrent.futures import ThreadPoolExecutor
+from usdfab.tracer import embree
+sys.setswitchinterval(1e-6)
+together = threading.Barrier(8)
+def first(_):
+    together.wait()
+    return embree.device()
+with ThreadPoolExecutor(8) as pool:
+    print(len(set(pool.map(first, range(8)))))
+"""
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
+    assert run.stdout.strip() == "1"
 
 
 class Hit(NamedTuple):
@@ -191,3 +210,19 @@ def test_threads_that_start_together_share_one_device():
         found = list(pool.map(ask, range(4)))
     assert len(made) == 1 and all(f is made[0] for f in found)
     assert all(hasattr(f, "__wrapped__") for f in (embree.library, embree.device, embree.function_addresses))
+
+
+def test_a_record_keeps_directions_and_a_curve_number_of_32_bits():
+    random = np.random.default_rng(0)
+    tangents = random.normal(size=(2, 50, 3))
+    tangents /= np.linalg.norm(tangents, axis=-1, keepdims=True)
+    numbers = random.integers(0, 2**31, 50)
+    numbers[:4] = 0, 2**15, 2**16 - 1, 2**31 - 1
+    records = patch_scene.pack_segments(*tangents, numbers)
+    assert records.nbytes == 16 * 50
+    for end in range(2):
+        kept = records[:, 3 * end : 3 * end + 3].astype(float)
+        kept /= np.linalg.norm(kept, axis=1, keepdims=True)
+        assert np.abs(kept - tangents[end]).max() < 4e-5
+    wide = records.astype(np.int64)
+    assert np.array_equal((wide[:, 6] & 0xFFFF) | (wide[:, 7] << 16), numbers)

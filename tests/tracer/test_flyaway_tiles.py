@@ -59,14 +59,21 @@ def _same_place(a: np.ndarray, b: np.ndarray, size: tuple[float, float]) -> np.n
     return np.abs(offset).max(axis=1) < 1e-9
 
 
-def test_only_free_ends_have_no_neighbour(patch):
+def test_only_free_ends_and_joints_outside_the_tile_have_no_neighbour(patch):
     for curves in patch.flyaways:
         vertices, _, first, flags, curve = _tile_segments(curves, patch.size)
         starts = _same_place(vertices[first], curves.points[curves.offsets[:-1]][curve], patch.size)
         ends = _same_place(vertices[first + 1], curves.points[curves.offsets[1:] - 1][curve], patch.size)
         assert starts.any() and ends.any()
-        np.testing.assert_array_equal((flags & NEIGHBOR_LEFT) == 0, starts)
-        np.testing.assert_array_equal((flags & NEIGHBOR_RIGHT) == 0, ends)
+        for alone, free, vertex in (
+            ((flags & NEIGHBOR_LEFT) == 0, starts, vertices[first]),
+            ((flags & NEIGHBOR_RIGHT) == 0, ends, vertices[first + 1]),
+        ):
+            assert alone[free].all()
+            # A joint is a sphere about the vertex.
+            place = vertex[alone & ~free][:, :2]
+            outside = (place <= -curves.radius) | (place >= np.asarray(patch.size) + curves.radius)
+            assert len(place) and outside.any(axis=1).all()
         # Neighbours stand beside each other in the buffer.
         steps = np.linalg.norm(vertices[first + 1] - vertices[first], axis=1)
         joined = first[(flags & NEIGHBOR_LEFT) != 0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import Executor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -20,6 +20,7 @@ from usdfab.errors import UsdfabError
 from usdfab.tracer import Tracer
 from usdfab.tracer.accumulate import Runner, ThreadRunner, accumulate
 from usdfab.tracer.checkpoint import Autosave, Identity, resume_work, save_work
+from usdfab.tracer.compilation import announce_compilation
 from usdfab.tracer.film import RAYS
 from usdfab.tracer.render import RenderSettings, Shot, develop, resolve_resolution, start
 from usdfab.tracer.schedule import Work
@@ -98,7 +99,8 @@ def _render(
             file.partial.unlink(missing_ok=True)  # --overwrite: it is not to be taken for this one
         autosave = Autosave(file.partial, identity, settings.spp, partial(warn, always=True), before)
         try:
-            with progress_bar(options.label, quiet=options.quiet) as update:
+            announce = nullcontext() if options.quiet else announce_compilation(say)
+            with announce, progress_bar(options.label, quiet=options.quiet) as update:
                 seconds = before + accumulate(
                     work,
                     runner,

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy  # its parts are loaded when they are first used
 from array_api_compat import array_namespace
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from usdfab.fabric import YarnParameters, ply_circles
 from usdfab.fibers.centerline import unit_centerline
@@ -100,7 +100,7 @@ def successors(shape: YarnShape, layout: Layout, draws: Draws) -> NDArray[np.int
     for ply in range(plies):
         ends, starts = slice(ply, None, plies), slice((ply + step) % plies, None, plies)
         cost = (x1[:, ends, None] - x0[:, None, starts]) ** 2 + (z1[:, ends, None] - z0[:, None, starts]) ** 2
-        successor[:, ends] = index[starts][np.stack([linear_sum_assignment(c)[1] for c in cost])]
+        successor[:, ends] = index[starts][np.stack([scipy.optimize.linear_sum_assignment(c)[1] for c in cost])]
     return successor
 
 

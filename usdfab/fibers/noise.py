@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from array_api_compat import array_namespace, is_torch_array
 
-from usdfab.fibers.randomness import hash_integers
+from usdfab.fibers.randomness import hash_further, hash_integers
 
 # The twelve directions from the centre of a cube to its edges (Perlin 2002), four of them repeated to make sixteen.
 _GRADIENTS = np.array(
@@ -38,11 +38,14 @@ def perlin3(x: Any, y: Any, z: Any, seed: int) -> Any:
     floors = [np.floor(_to_numpy(c)) for c in coordinates]
     fractions = [c - xp.asarray(f, dtype=c.dtype) for c, f in zip(coordinates, floors, strict=True)]
     fades = [t * t * t * (t * (t * 6.0 - 15.0) + 10.0) for t in fractions]
+    # Lattice points of the cell's corners, hashed axis by axis.
+    states = [hash_integers(seed)]
+    for f in floors:
+        states = [hash_further(state, f + bit) for bit in range(2) for state in states]
     total: Any = 0.0
     for corner in range(8):
         bits = [(corner >> k) & 1 for k in range(3)]
-        cell = hash_integers(seed, *(f + b for f, b in zip(floors, bits, strict=True)))
-        gradient = _GRADIENTS[(cell >> np.uint64(60)).astype(np.int64)]
+        gradient = _GRADIENTS[(states[corner] >> np.uint64(60)).astype(np.int64)]
         dot: Any = 0.0
         weight: Any = 1.0
         for k in range(3):

@@ -21,12 +21,16 @@ def _mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 def hash_integers(*keys: ArrayLike) -> NDArray[np.uint64]:
     """A 64-bit hash of broadcast integer keys; the order of the keys matters."""
-    arrays = np.broadcast_arrays(*(np.asarray(k, dtype=np.int64) for k in keys))
-    state = np.zeros(arrays[0].shape, dtype=np.uint64)
-    with np.errstate(over="ignore"):
-        for array in arrays:
-            state = _mix(state + _GOLDEN + array.astype(np.uint64))
+    state = np.zeros((), dtype=np.uint64)
+    for key in keys:
+        state = hash_further(state, key)
     return state
+
+
+def hash_further(state: NDArray[np.uint64], key: ArrayLike) -> NDArray[np.uint64]:
+    """``hash_integers(*keys, key)`` from ``state = hash_integers(*keys)``: what keys have in common is hashed once."""
+    with np.errstate(over="ignore"):
+        return _mix(np.asarray(state + _GOLDEN + np.asarray(key, dtype=np.int64).astype(np.uint64)))
 
 
 def uniform(*keys: ArrayLike) -> NDArray[np.float64]:

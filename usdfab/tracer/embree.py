@@ -30,7 +30,7 @@ _FORMAT_UCHAR, _FORMAT_UINT, _FORMAT_UINT3 = 0x1001, 0x5001, 0x5003
 _FORMAT_FLOAT3, _FORMAT_FLOAT4 = 0x9003, 0x9004
 _FORMAT_FLOAT3X4_ROW_MAJOR = 0x9134
 _BUILD_QUALITY_HIGH = 2
-_SCENE_ROBUST = 4
+_SCENE_COMPACT, _SCENE_ROBUST = 2, 4
 _PROPERTY_VERSION, _PROPERTY_CURVES, _PROPERTY_FILTER = 0, 99, 66
 _ERRORS = {1: "unknown error", 2: "invalid argument", 3: "invalid operation", 4: "out of memory", 5: "unsupported CPU"}
 
@@ -116,7 +116,7 @@ def library() -> ctypes.CDLL:
 
 @_once
 def device() -> int:
-    """The one Embree device of this process."""
+    """The one Embree device of this process: a scene of one device takes no geometry of another."""
     lib = library()
     handle = lib.rtcNewDevice(None)
     if not handle:
@@ -156,7 +156,7 @@ class EmbreeScene:
         self._geometries = 0
         self.handle: int = lib.rtcNewScene(device())
         self._finalizer = weakref.finalize(self, lib.rtcReleaseScene, self.handle)
-        lib.rtcSetSceneFlags(self.handle, _SCENE_ROBUST)
+        lib.rtcSetSceneFlags(self.handle, _SCENE_COMPACT | _SCENE_ROBUST)
         lib.rtcSetSceneBuildQuality(self.handle, _BUILD_QUALITY_HIGH)
 
     def add(self, geometry_type: int, buffers: list[tuple[int, int, int, NDArray, int]], time_steps: int = 1) -> None:

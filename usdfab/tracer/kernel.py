@@ -36,7 +36,7 @@ from usdfab.tracer.lights import FAR, escaped_radiance, hit_light, light_blocks,
 from usdfab.tracer.slab import HIT, enter_slab, inverse_columns, leave_slab, slab_occluded, to_patch, trace_slab
 from usdfab.tracer.surfaces import MAX_SURFACES, surface_frame, trace_macro, transmittance
 from usdfab.tracer.textures import lookup, normal_at, opacity_at, surface_at
-from usdfab.tracer.world import ALBEDO_MAP, FIRST_CURVE, FIRST_PATCH, FIRST_SEGMENT, borrowed
+from usdfab.tracer.world import ALBEDO_MAP, FIRST_CURVE, FIRST_PATCH, FIRST_SEGMENT, MATERIAL, YARN, borrowed
 
 RUSSIAN_ROULETTE_DEPTH = 5
 SHADOW_ROULETTE = 2.0 * math.pi
@@ -238,7 +238,9 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
             qx = (1.0 - s) * c[segment, 0] + s * c[segment, 3]
             qy = (1.0 - s) * c[segment, 1] + s * c[segment, 4]
             qz = (1.0 - s) * c[segment, 2] + s * c[segment, 5]
-            row = np.int64(c[segment, 6])
+            curve = (np.int64(c[segment, 6]) & 0xFFFF) | (np.int64(c[segment, 7]) << 16)
+            owner = patches.curves[int(patches.table[patch, FIRST_CURVE]) + curve]
+            row = np.int64(owner[MATERIAL])
             # Tangents are vectors, normals covectors.
             ax = qx * inverse[0] + qy * inverse[3] + qz * inverse[6]
             ay = qx * inverse[1] + qy * inverse[4] + qz * inverse[7]
@@ -264,9 +266,8 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                 out[ALBEDO + 1] += min(tint_g * patches.albedo[row, 1], 1.0)
                 out[ALBEDO + 2] += min(tint_b * patches.albedo[row, 2], 1.0)
                 if set_ids:
-                    out[FIBER_ID] = c[segment, 7]
-                    curve = np.int64(patches.table[patch, FIRST_CURVE]) + np.int64(c[segment, 7]) - 1
-                    out[YARN_ID] = patches.yarns[curve]
+                    out[FIBER_ID] = 1 + curve
+                    out[YARN_ID] = owner[YARN]
         else:
             packed, er, eg, eb = surface_at(world.materials, world.textures, material, tx, ty)
             mapped, qx, qy, qz = normal_at(world.materials, world.textures, material, tx, ty)

@@ -30,26 +30,30 @@ metres, with fibers of 1e-5, it returns wrong places along the segment."""
 MAX_TILE_SEGMENTS = 1_500_000
 """Beyond this a tile stays at one repeat of the weave."""
 
-BEND = 0.03
-"""How far, in fiber radii, a straight segment may be from the spline: knots in between are left out."""
+BEND = 0.15
+"""How far, in fiber radii, a straight segment may be from the spline: knots in between are left out.
+
+A fiber is then at most that little out of place, and its shading frame is the spline's own all the same. A fifth of
+this makes twice as many segments and the same picture, within 0.3 % of its brightness.
+"""
 
 
 @dataclass(frozen=True)
 class PatchScene:
     """One tile, ready for the kernels. Lengths in units of which ``units_per_meter`` make a metre.
 
-    ``segments`` (S, 8) float32: the spline's unit tangents at both ends of each segment, row of ``materials``, 1 +
-    curve; ``materials`` (M, N) packed by ``pack_fiber``; ``albedo`` (M, 4) fiber albedo coefficients and
-    1 / q(gamma_N); ``yarns`` (curves,) 1 + yarn, warp first, then weft.
+    ``segments`` (S, 8) int16, packed by ``pack_segments``; ``curves`` (curves, 2) 1 + yarn, warp first, then weft, and
+    row of ``materials``; ``materials`` (M, N) packed by ``pack_fiber``; ``albedo`` (M, 4) fiber albedo coefficients and
+    1 / q(gamma_N).
     """
 
     size: tuple[float, float]
     z_range: tuple[float, float]
     scene: EmbreeScene
-    segments: NDArray[np.float32]
+    segments: NDArray[np.int16]
     materials: NDArray[np.float64]
     albedo: NDArray[np.float64]
-    yarns: NDArray[np.int32]
+    curves: NDArray[np.int32]
     units_per_meter: float
     epsilon: float
     """Shortest ray: hits nearer than this are the surface the ray starts on."""
@@ -57,7 +61,7 @@ class PatchScene:
     @property
     def nbytes(self) -> int:
         """Bytes of vertices, indices and records; Embree's hierarchy comes on top."""
-        return self.scene.nbytes + self.segments.nbytes + self.materials.nbytes + self.yarns.nbytes
+        return self.scene.nbytes + self.segments.nbytes + self.materials.nbytes + self.curves.nbytes
 
 
 def build_tiles(fabric: FabricParameters) -> list[PatchScene]:
@@ -74,7 +78,7 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
     radius = min(s.radius for s in patch.systems)
     units = FIBER_RADIUS_UNITS / radius
     vertices, first, flags, segments = [], [], [], []
-    yarns: list[NDArray] = []
+    curves: list[NDArray] = []
     materials: list[NDArray] = []
     albedo: list[tuple[float, ...]] = []
     base = 0
@@ -85,10 +89,9 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
         vertices.append(units * np.c_[v, np.full(len(v), system.radius)])
         first.append(f + base)
         flags.append(g)
-        row = color_of_curve.reshape(-1)[curve] + len(materials)
-        number = 1 + curve + sum(len(y) for y in yarns)
-        segments.append(np.c_[t[f], t[f + 1], row, number])
-        yarns.append(system.yarn + (1 if system.system == "warp" else 1 + int(patch.warp.yarn.max())))
+        segments.append(pack_segments(t[f], t[f + 1], curve + sum(len(c) for c in curves)))
+        first_yarn = 1 if system.system == "warp" else 2 + int(patch.warp.yarn.max())
+        curves.append(np.c_[system.yarn + first_yarn, color_of_curve.reshape(-1) + len(materials)])
         base += len(v)
         materials.extend(_pack(yarn, tuple(c)) for c in colors)
         # What turns ln C into the root of the absorption.
@@ -101,13 +104,23 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
         size=(units * patch.size[0], units * patch.size[1]),
         z_range=(units * (low - 1e-3 * radius), units * (high + 1e-3 * radius)),
         scene=scene,
-        segments=np.concatenate(segments).astype(np.float32),
+        segments=np.concatenate(segments),
         materials=np.stack(materials),
         albedo=np.asarray(albedo),
-        yarns=np.concatenate(yarns).astype(np.int32),
+        curves=np.concatenate(curves).astype(np.int32),
         units_per_meter=units,
         epsilon=5e-3 * FIBER_RADIUS_UNITS,
     )
+
+
+def pack_segments(start: NDArray, end: NDArray, curve: NDArray) -> NDArray[np.int16]:
+    """(S, 8) what a hit needs to know of its segment, in 16 bytes.
+
+    The spline's unit tangents at both ends (S, 3), 32767 for 1: kernels use their direction only. Then the curve's
+    number, its lower 16 bits first.
+    """
+    tangents = np.rint(32767.0 * np.c_[start, end]).astype(np.int16)
+    return np.c_[tangents, np.asarray(curve, dtype="<u4").view("<i2").reshape(-1, 2)]
 
 
 def tile_copies(fabric: FabricParameters) -> tuple[int, int]:
@@ -181,6 +194,9 @@ def _tile_segments(
 ) -> tuple[NDArray, NDArray, NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]:
     """All segments that overlap the tile [0, size], copies from the neighbouring tiles included.
 
+    Segments know the one before and after them only where that one overlaps the tile too, else their joint, a sphere
+    about their common vertex, does not.
+
     Returns vertices (V, 3), tangents (V, 3), first vertex (S,), neighbour flags (S,) and curve (S,).
     """
     points, tangents, offsets = (
@@ -194,7 +210,10 @@ def _tile_segments(
     else:
         # A curve's own segments: from vertex 1 up to the first vertex of its successor, one vertex spare each side.
         starts = np.flatnonzero((place >= 1) & (place <= lengths - 4))
-    joined = place[starts] > 0, place[starts] < lengths[starts] - 2
+    # Which vertices have a segment before and after the one that starts there, be it a spare one.
+    joined = place > 0, place < lengths - 2
+    own = np.zeros(len(points) + 1, dtype=bool)
+    own[starts] = True
     low = np.minimum(points[starts], points[starts + 1])[:, :2] - system.radius
     high = np.maximum(points[starts], points[starts + 1])[:, :2] + system.radius
 
@@ -211,7 +230,13 @@ def _tile_segments(
             if not len(chosen):
                 continue
             used = np.zeros(len(points), dtype=bool)
-            before, after = (flag[inside] for flag in joined)
+            here = np.zeros(len(points) + 1, dtype=bool)
+            here[chosen] = True
+            # A spare neighbour stands for a segment of another curve, of which nothing is known here.
+            before, after = (
+                flag[chosen] & (here[chosen + step] | ~own[chosen + step])
+                for flag, step in zip(joined, (-1, 1), strict=True)
+            )
             for neighbors in (chosen, chosen + 1, chosen[before] - 1, chosen[after] + 2):
                 used[neighbors] = True
             new_index = np.cumsum(used) - 1

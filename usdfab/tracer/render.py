@@ -38,7 +38,7 @@ from usdfab.tracer.memory import check_memory
 from usdfab.tracer.patch_scene import PatchScene, build_tiles
 from usdfab.tracer.schedule import Window, Work, bounds, plan_tiles, relative_error
 from usdfab.tracer.textures import load_texture_images, pack_materials, pack_textures
-from usdfab.tracer.world import MATERIAL_OF_SEGMENT, PATCH_COLUMNS, Patches, View, World
+from usdfab.tracer.world import MATERIAL, PATCH_COLUMNS, Patches, View, World
 from usdfab.usd.scene import Camera, Scene
 
 MAX_PIXELS = 2**28
@@ -269,24 +269,23 @@ def _view(camera: Camera, width: int, height: int, moves: bool) -> View:
 
 
 def _pack_patches(scenes: list[PatchScene]) -> Patches:
-    rows, segments, materials, curves = [], 0, 0, 0
-    records = [np.zeros((0, 8), dtype=np.float32)]
+    rows, segments, materials, count = [], 0, 0, 0
+    curves = []
     for scene in scenes:
-        rows.append([*scene.size, *scene.z_range, scene.epsilon, segments, scene.units_per_meter, curves])
-        record = scene.segments.copy()
-        record[:, MATERIAL_OF_SEGMENT] += materials
-        records.append(record)
-        segments += len(record)
+        rows.append([*scene.size, *scene.z_range, scene.epsilon, segments, scene.units_per_meter, count])
+        curves.append(scene.curves.copy())
+        curves[-1][:, MATERIAL] += materials
+        segments += len(scene.segments)
         materials += len(scene.materials)
-        curves += len(scene.yarns)
-    joined = [np.concatenate([getattr(s, name) for s in scenes]) for name in ("materials", "albedo", "yarns") if scenes]
-    if not scenes:  # kernels read row 0 before they know whether they need it
-        joined = [np.zeros((1, FIBER_SIZE)), np.zeros((1, 4)), np.zeros(1, dtype=np.int32)]
+        count += len(scene.curves)
     return Patches(
-        np.array(rows, dtype=float).reshape(-1, PATCH_COLUMNS),
-        np.array([s.scene.handle for s in scenes], dtype=np.uint64),
-        np.concatenate(records),
-        *joined,
+        table=np.array(rows, dtype=float).reshape(-1, PATCH_COLUMNS),
+        handles=np.array([s.scene.handle for s in scenes], dtype=np.uint64),
+        segments=np.concatenate([np.zeros((0, 8), dtype=np.int16), *(s.segments for s in scenes)]),
+        # Without fabrics one row of each: kernels read it before they know whether they need it.
+        materials=np.concatenate([s.materials for s in scenes] or [np.zeros((1, FIBER_SIZE))]),
+        albedo=np.concatenate([s.albedo for s in scenes] or [np.zeros((1, 4))]),
+        curves=np.concatenate(curves or [np.zeros((1, 2), dtype=np.int32)]),
     )
 
 

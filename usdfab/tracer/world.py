@@ -16,8 +16,8 @@ from usdfab.tracer.textures import Materials, Textures
 WIDTH, HEIGHT, LOW, HIGH, EPSILON, FIRST_SEGMENT, UNITS, FIRST_CURVE = 0, 1, 2, 3, 4, 5, 6, 7
 PATCH_COLUMNS = 8
 
-# Columns of ``Patches.segments`` after the tangents.
-MATERIAL_OF_SEGMENT, CURVE_OF_SEGMENT = 6, 7
+# Columns of ``Patches.curves``.
+YARN, MATERIAL = 0, 1
 
 # Columns of ``Macro.fabrics``.
 FIRST_PATCH, VARIANTS, UV_SCALE, ALBEDO_MAP = 0, 1, 2, 3
@@ -31,26 +31,26 @@ class Patches(NamedTuple):
     ----------
     table: (P, PATCH_COLUMNS)
         Size and lowest and highest place of the tile, shortest ray, first segment, patch units per metre,
-        first of its curves in ``yarns``.
+        first of its curves in ``curves``.
     handles: (P,)
         Embree scenes.
-    segments: (S, 8) float32
-        The spline's unit tangents at both ends (6), row of ``materials``, 1 + curve of the patch: all that a hit
-        needs, in one cache line.
+    segments: (S, 8) int16
+        The spline's tangents at both ends (6) and the curve of the patch (``patch_scene.pack_segments``): all that a
+        hit needs, in one cache line.
     materials: (M, FIBER_SIZE)
         Packed by ``pack_fiber``.
     albedo: (M, 4)
         Fiber albedo coefficient C (3) and 1 / q(gamma_N), with which C becomes absorption.
-    yarns: (C,) int32
-        1 + yarn of each curve, warp first; all patches, one after the other.
+    curves: (C, 2) int32
+        1 + yarn, warp first, and row of ``materials`` of each curve; all patches, one after the other.
     """
 
     table: NDArray[np.float64]
     handles: NDArray[np.uint64]
-    segments: NDArray[np.float32]
+    segments: NDArray[np.int16]
     materials: NDArray[np.float64]
     albedo: NDArray[np.float64]
-    yarns: NDArray[np.int32]
+    curves: NDArray[np.int32]
 
 
 class Macro(NamedTuple):
@@ -141,7 +141,7 @@ def borrowed(world):
         borrow(m.mesh), borrow(m.fabrics), borrow(m.placements), borrow(m.first), borrow(m.bounds), m.meshes,
     )  # fmt: skip
     patches = Patches(
-        borrow(p.table), borrow(p.handles), borrow(p.segments), borrow(p.materials), borrow(p.albedo), borrow(p.yarns)
+        borrow(p.table), borrow(p.handles), borrow(p.segments), borrow(p.materials), borrow(p.albedo), borrow(p.curves)
     )
     return World(
         macro,

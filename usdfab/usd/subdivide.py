@@ -14,12 +14,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import scipy  # its parts are loaded when they are first used: most stages have nothing to refine
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array, diags_array, vstack
-from scipy.sparse.csgraph import connected_components
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -164,12 +166,12 @@ def refined(
     limit:
         Move the points to where they would be after infinitely many steps (only after one step at least).
     """
-    matrix = csr_array(_identity(mesh.points))
+    matrix = scipy.sparse.csr_array(_identity(mesh.points))
     for _ in range(levels):
         mesh, step = _step(mesh, scheme, linear)
-        matrix = csr_array(step @ matrix)
+        matrix = scipy.sparse.csr_array(step @ matrix)
     if limit and levels and not linear:
-        matrix = csr_array(_limit(mesh, scheme) @ matrix)
+        matrix = scipy.sparse.csr_array(_limit(mesh, scheme) @ matrix)
     return mesh, matrix
 
 
@@ -234,8 +236,8 @@ def normal_groups(mesh: Topology) -> Ints:
     end = np.where(same_way, after_two, two)
     rows, columns = np.concatenate([one, after_one]), np.concatenate([start, end])
     number = len(mesh.indices)
-    graph = coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(number, number))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+    graph = scipy.sparse.coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(number, number))
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 # --- one step --------------------------------------------------------------------------------------------------------
@@ -252,7 +254,7 @@ def _step(mesh: Topology, scheme: Scheme, linear: bool) -> tuple[Topology, csr_a
         pair = (middle, _identity(mesh.points))
         edge_points, old_points = pair if linear else _catmull_clark(mesh, middle, face_points)
         stacked = [old_points, edge_points, face_points]
-    return _split(mesh, scheme), csr_array(vstack(stacked))
+    return _split(mesh, scheme), scipy.sparse.csr_array(scipy.sparse.vstack(stacked))
 
 
 def _split(mesh: Topology, scheme: Scheme) -> Topology:
@@ -289,8 +291,8 @@ def _catmull_clark(mesh: Topology, middle: csr_array, face_points: csr_array) ->
     ends = mesh.edges.ravel()
     mean_edge = _matrix(ends, np.repeat(np.arange(len(mesh.edges)), 2), 1.0 / valence[ends], middle.T.shape)
     smooth = (
-        diags_array(1.0 / valence) @ (mean_face @ face_points + 2.0 * mean_edge @ middle)
-        + diags_array((valence - 3.0) / valence)
+        scipy.sparse.diags_array(1.0 / valence) @ (mean_face @ face_points + 2.0 * mean_edge @ middle)
+        + scipy.sparse.diags_array((valence - 3.0) / valence)
     )  # fmt: skip
     return edge_points, _old_points(mesh, smooth, 1.0 / 8.0)
 
@@ -302,7 +304,9 @@ def _loop(mesh: Topology, middle: csr_array) -> tuple[csr_array, csr_array]:
     edge_points = _blend(np.clip(mesh.sharpness, 0.0, 1.0), 0.75 * middle + across, middle)
     valence = np.maximum(np.bincount(mesh.edges.ravel(), minlength=mesh.points), 1)
     beta = _loop_weight(valence)
-    smooth = diags_array(1.0 - valence * beta) + diags_array(beta) @ _neighbours(mesh, np.ones(len(mesh.edges), bool))
+    smooth = scipy.sparse.diags_array(1.0 - valence * beta) + scipy.sparse.diags_array(beta) @ _neighbours(
+        mesh, np.ones(len(mesh.edges), bool)
+    )
     return edge_points, _old_points(mesh, smooth, 1.0 / 8.0)
 
 
@@ -337,14 +341,14 @@ def _limit(mesh: Topology, scheme: Scheme) -> csr_array:
     around = _neighbours(mesh, np.ones(len(mesh.edges), dtype=bool))
     if scheme == "loop":
         weight = 1.0 / (valence + 3.0 / (8.0 * _loop_weight(valence)))
-        smooth = diags_array(1.0 - valence * weight) + diags_array(weight) @ around
+        smooth = scipy.sparse.diags_array(1.0 - valence * weight) + scipy.sparse.diags_array(weight) @ around
     else:
         diagonal = mesh.indices[mesh.following[mesh.following]]
         across = _matrix(mesh.indices, diagonal, 1.0, (mesh.points, mesh.points))
-        total = diags_array(valence.astype(np.float64) ** 2) + 4.0 * around + across
+        total = scipy.sparse.diags_array(valence.astype(np.float64) ** 2) + 4.0 * around + across
         # n (n + 5) wherever the surface is smooth; elsewhere the row is not used, but stays finite.
-        smooth = diags_array(1.0 / np.asarray(total.sum(axis=1)).ravel()) @ total
-    return _old_points(mesh, csr_array(smooth), 1.0 / 6.0, limit=True)
+        smooth = scipy.sparse.diags_array(1.0 / np.asarray(total.sum(axis=1)).ravel()) @ total
+    return _old_points(mesh, scipy.sparse.csr_array(smooth), 1.0 / 6.0, limit=True)
 
 
 def _neighbours(mesh: Topology, chosen: NDArray[np.bool_]) -> csr_array:
@@ -355,15 +359,17 @@ def _neighbours(mesh: Topology, chosen: NDArray[np.bool_]) -> csr_array:
 
 def _blend(weight: Floats, zero: csr_array, one: csr_array) -> csr_array:
     """Rows of ``zero`` where ``weight`` is 0, of ``one`` where it is 1."""
-    blended = csr_array(diags_array(1.0 - weight) @ zero + diags_array(weight) @ one)
+    blended = scipy.sparse.csr_array(
+        scipy.sparse.diags_array(1.0 - weight) @ zero + scipy.sparse.diags_array(weight) @ one
+    )
     blended.eliminate_zeros()
     return blended
 
 
 def _identity(number: int) -> csr_array:
-    return csr_array(diags_array(np.ones(number)))
+    return scipy.sparse.csr_array(scipy.sparse.diags_array(np.ones(number)))
 
 
 def _matrix(rows: Ints, columns: Ints, values: Floats | float, shape: tuple[int, int]) -> csr_array:
     data = np.broadcast_to(np.asarray(values, dtype=np.float64), rows.shape)
-    return csr_array(coo_array((data, (rows, columns)), shape=shape))
+    return scipy.sparse.csr_array(scipy.sparse.coo_array((data, (rows, columns)), shape=shape))
