@@ -191,6 +191,7 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                     direct_r, direct_g, direct_b = direct_r + er, direct_g + eg, direct_b + eb
                 if first and at_light:
                     out[ALPHA] += 1.0
+                    out[DEPTH] += travelled + t_light
                 finished = True
                 break
             material = np.int64(macro.material[prim])
@@ -214,8 +215,9 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                 continue
             inverse = inverse_columns(m)
             slab_mesh = mesh
-            tinted = macro.tinted[prim] >= 0 or macro.fabrics[material, ALBEDO_MAP] >= 0.0
-            if tinted:
+            tinted, tint_r, tint_g, tint_b = False, 1.0, 1.0, 1.0
+            if macro.tinted[prim] >= 0 or macro.fabrics[material, ALBEDO_MAP] >= 0.0:
+                tinted = True
                 tint_r, tint_g, tint_b = _tint_at(world, material, prim, hu, hv, tx, ty)
             step = t - back
             ox, oy, oz = ox + step * dx, oy + step * dy, oz + step * dz
@@ -287,7 +289,8 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                 wox, woy, woz = _to_local(shading, -dx, -dy, -dz)
             nx, ny, nz = shading[6], shading[7], shading[8]
             surface = prepare_surface(packed, max(woz, 1e-4))
-            near, skip_mesh, skip_distance = 1e-6 * (1.0 + travelled), nowhere, 0.0
+            # Embree's single precision counts from the world's origin.
+            near, skip_mesh, skip_distance = 1e-6 * (1.0 + travelled + abs(ox) + abs(oy) + abs(oz)), nowhere, 0.0
             if first:
                 out[ALBEDO], out[ALBEDO + 1] = out[ALBEDO] + packed[0], out[ALBEDO + 1] + packed[1]
                 out[ALBEDO + 2] += packed[2]

@@ -51,8 +51,8 @@ def enter_slab(macro, patches, material, tx, ty, nx, ny, nz, faces, frame, dx, d
 
     Returns
     -------
-    (ok, first patch, variants, M (9), stretch, place in the tile (3), tile (2), world distance stepped back); not ok
-    where the surface has no usable frame.
+    (ok, first patch, variants, M (9), patch units per metre along the normal, place in the tile (3), tile (2), world
+    distance stepped back); not ok where the surface has no usable frame.
     """
     row = macro.fabrics[material]
     first, count = int(row[FIRST_PATCH]), int(row[VARIANTS])
