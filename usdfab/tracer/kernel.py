@@ -280,7 +280,7 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
             gx, gy, gz = side * gx, side * gy, side * gz
             shading = _shading_frame(
                 side * frame[0], side * frame[1], side * frame[2], frame[3], frame[4], frame[5], frame[6], frame[7],
-                frame[8], mapped, qx, qy, qz,
+                frame[8], mapped, side * qx, side * qy, qz,
             )  # fmt: skip
             wox, woy, woz = _to_local(shading, -dx, -dy, -dz)
             if woz <= 1e-4:
