@@ -88,7 +88,7 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
         row = color_of_curve.reshape(-1)[curve] + len(materials)
         number = 1 + curve + sum(len(y) for y in yarns)
         segments.append(np.c_[t[f], t[f + 1], row, number])
-        yarns.append(system.yarn + (1 if system.system == "warp" else 1 + int(patch.warp.yarn.max())))
+        yarns.append(system.yarn + (1 if system.system == "warp" else 2 + int(patch.warp.yarn.max())))
         base += len(v)
         materials.extend(_pack(yarn, tuple(c)) for c in colors)
         # What turns ln C into the root of the absorption.
