@@ -181,7 +181,7 @@ def blurred_edge(distance, focus, radius):
 @pytest.mark.parametrize(("distance", "focus"), [(2.0, 1.0), (1.0, 1.6), (1.5, 0.9)])
 def test_blur_of_an_edge(distance, focus):
     radius = 0.03
-    half = replace(plane(4.0), points=plane(4.0).points + [2.0, 0, -distance])
+    half = replace(plane(4.0), points=plane(4.0).points + np.array([2.0, 0, -distance]))
     camera = replace(look((0, 0, 0), (0, 0, -1), (0.1, 1e-3)), lens_radius=radius, focus_distance=focus)
     seen = alpha([half], camera)
     np.testing.assert_allclose(seen, blurred_edge(distance, focus, radius), atol=0.035)

@@ -85,7 +85,12 @@ def test_nearly_white_room_with_a_lamp():
     check(scene, look((0.1, 0.4, 0.1), (0, 0, 0), (0.4, 0.4)), 300)
 
 
-CURVED = [("ball", 600), pytest.param("ball", 2400, marks=SLOW), ("waves", 500), pytest.param("waves", 2000, marks=SLOW)]
+CURVED = [
+    ("ball", 600),
+    pytest.param("ball", 2400, marks=SLOW),
+    ("waves", 500),
+    pytest.param("waves", 2000, marks=SLOW),
+]
 
 
 @pytest.mark.parametrize("eye", [(0.01, -0.05, 0.1), (0.0, 0.1, -0.04)])

@@ -109,8 +109,10 @@ def _build(
 
 def _moves(mesh: Mesh) -> bool:
     """Whether anything of a mesh is elsewhere when the shutter closes."""
-    pairs = (mesh.points, mesh.points_close), (mesh.placements, mesh.placements_close)
-    return any(close is not None and not np.array_equal(opening, close) for opening, close in pairs)
+    if mesh.points_close is not None and not np.array_equal(mesh.points, mesh.points_close):
+        return True
+    placed, close = mesh.placements, mesh.placements_close
+    return placed is not None and close is not None and not np.array_equal(placed, close)
 
 
 def _points(mesh: Mesh, keys: int) -> NDArray[np.float64]:
