@@ -379,7 +379,8 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
         if bsdf_pdf <= 0.0 or beta_r + beta_g + beta_b <= 0.0:
             break
         if depth >= RUSSIAN_ROULETTE_DEPTH:
-            survive = min(0.95, max(beta_r, beta_g, beta_b))
+            # No bound below 1: it would let the throughput of long paths in white surroundings grow for ever.
+            survive = min(1.0, 0.95 * max(beta_r, beta_g, beta_b))
             stream, u0 = next_uniform(stream)
             if u0 >= survive:
                 break
