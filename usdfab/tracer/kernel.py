@@ -191,6 +191,7 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                     direct_r, direct_g, direct_b = direct_r + er, direct_g + eg, direct_b + eb
                 if first and at_light:
                     out[ALPHA] += 1.0
+                    out[DEPTH] += travelled + t_light
                 finished = True
                 break
             material = np.int64(macro.material[prim])
@@ -214,8 +215,9 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                 continue
             inverse = inverse_columns(m)
             slab_mesh = mesh
-            tinted = macro.tinted[prim] >= 0 or macro.fabrics[material, ALBEDO_MAP] >= 0.0
-            if tinted:
+            tinted, tint_r, tint_g, tint_b = False, 1.0, 1.0, 1.0
+            if macro.tinted[prim] >= 0 or macro.fabrics[material, ALBEDO_MAP] >= 0.0:
+                tinted = True
                 tint_r, tint_g, tint_b = _tint_at(world, material, prim, hu, hv, tx, ty)
             step = t - back
             ox, oy, oz = ox + step * dx, oy + step * dy, oz + step * dz
@@ -279,7 +281,7 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
             gx, gy, gz = side * gx, side * gy, side * gz
             shading = _shading_frame(
                 side * frame[0], side * frame[1], side * frame[2], frame[3], frame[4], frame[5], frame[6], frame[7],
-                frame[8], mapped, qx, qy, qz,
+                frame[8], mapped, side * qx, side * qy, qz,
             )  # fmt: skip
             wox, woy, woz = _to_local(shading, -dx, -dy, -dz)
             if woz <= 1e-4:
@@ -288,7 +290,8 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                 wox, woy, woz = _to_local(shading, -dx, -dy, -dz)
             nx, ny, nz = shading[6], shading[7], shading[8]
             surface = prepare_surface(packed, max(woz, 1e-4))
-            near, skip_mesh, skip_distance = 1e-6 * (1.0 + travelled), nowhere, 0.0
+            # Embree's single precision counts from the world's origin.
+            near, skip_mesh, skip_distance = 1e-6 * (1.0 + travelled + abs(ox) + abs(oy) + abs(oz)), nowhere, 0.0
             if first:
                 out[ALBEDO], out[ALBEDO + 1] = out[ALBEDO] + packed[0], out[ALBEDO + 1] + packed[1]
                 out[ALBEDO + 2] += packed[2]
@@ -377,7 +380,8 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
         if bsdf_pdf <= 0.0 or beta_r + beta_g + beta_b <= 0.0:
             break
         if depth >= RUSSIAN_ROULETTE_DEPTH:
-            survive = min(0.95, max(beta_r, beta_g, beta_b))
+            # No bound below 1: it would let the throughput of long paths in white surroundings grow for ever.
+            survive = min(1.0, 0.95 * max(beta_r, beta_g, beta_b))
             stream, u0 = next_uniform(stream)
             if u0 >= survive:
                 break

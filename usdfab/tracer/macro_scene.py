@@ -32,7 +32,7 @@ def build_macro(scene: Scene, tiles: Sequence[Tiles], albedo_maps: Sequence[int]
     meshes = scene.meshes
     if not meshes:
         raise UsdfabError("the stage has no visible mesh", place=scene.path, remedy="add a Mesh or check visibility")
-    keys = 2 if any(m.points_close is not None or m.placements_close is not None for m in meshes) else 1
+    keys = 2 if any(_moves(mesh) for mesh in meshes) else 1
     parts = [_mesh_arrays(mesh, _uv_scale(scene, mesh), keys) for mesh in meshes]
     first = np.r_[0, np.cumsum([len(m.triangles) for m in meshes])]
     fabrics = np.full((len(scene.materials), FABRIC_COLUMNS), -1.0)
@@ -107,6 +107,14 @@ def _build(
     )
 
 
+def _moves(mesh: Mesh) -> bool:
+    """Whether anything of a mesh is elsewhere when the shutter closes."""
+    if mesh.points_close is not None and not np.array_equal(mesh.points, mesh.points_close):
+        return True
+    placed, close = mesh.placements, mesh.placements_close
+    return placed is not None and close is not None and not np.array_equal(placed, close)
+
+
 def _points(mesh: Mesh, keys: int) -> NDArray[np.float64]:
     """(keys, V, 3)."""
     close = mesh.points if mesh.points_close is None else mesh.points_close
@@ -157,8 +165,9 @@ def _mesh_arrays(
         double_area = np.linalg.norm(cross, axis=1)
         proper = double_area > 0.0
         if not proper.all():  # Embree never reports triangles without area; keep their numbers finite
-            cross[~proper], double_area[~proper] = (0.0, 0.0, 1.0), 1.0
+            double_area[~proper] = 1.0
         geometric = cross / double_area[:, None]
+        geometric[~proper] = 0.0, 0.0, 1.0
         if mesh.normals is None:
             normals = np.repeat(geometric[:, None], 3, axis=1)
         elif key == 0:
@@ -201,7 +210,9 @@ def _gradients(
     if mesh.normals is None:
         return np.repeat(gradient[:, None], 3, axis=1)
     total = np.zeros((len(mesh.points), 7))
-    weighted = np.c_[gradient, np.ones(len(gradient))] * double_area[:, None]
+    # Faces without area, and those whose uv say nothing, have no part in their neighbours' cloth.
+    weight = np.where(flat, 0.0, np.linalg.norm(np.cross(*edges), axis=1))
+    weighted = np.c_[gradient, np.ones(len(gradient))] * weight[:, None]
     for corner in range(3):
         np.add.at(total, mesh.triangles[:, corner], weighted)
     smooth = (total[:, :6] / np.maximum(total[:, 6:], 1e-30))[mesh.triangles]

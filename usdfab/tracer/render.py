@@ -127,7 +127,8 @@ class Tracer:
         strict:
             Whether a texture that cannot be read is an error; else it is one of ``warnings``.
         """
-        if not scene.lights and not any(np.any(m.emissive) for m in scene.materials):
+        glow = any(np.any(m.emissive) or "emissiveColor" in m.textures for m in scene.materials if m.fabric < 0)
+        if not scene.lights and not glow:
             raise UsdfabError("the stage has no light", place=scene.path, remedy="add a UsdLux light, e.g. a DomeLight")
         self._tiles: list[PatchScene] = []
         tiles_of: dict[int, Tiles] = {}
@@ -177,7 +178,9 @@ class Tracer:
         A pure function: the same on any machine of the same kind, and the same however samples are divided among calls.
         """
         film, squares = sums[..., :CHANNELS].copy(), sums[..., CHANNELS:].copy()
-        view = _view(shot.camera, shot.width, shot.height, self._moves or shot.camera.to_world_close is not None)
+        close = shot.camera.to_world_close
+        moves = self._moves or (close is not None and not np.array_equal(close, shot.camera.to_world))
+        view = _view(shot.camera, shot.width, shot.height, moves)
         render_tile(self.world, view, np.uint64(shot.seed), window, first, samples, shot.max_depth, film, squares)
         return np.concatenate([film, squares], axis=-1)
 

@@ -51,8 +51,8 @@ def enter_slab(macro, patches, material, tx, ty, nx, ny, nz, faces, frame, dx, d
 
     Returns
     -------
-    (ok, first patch, variants, M (9), stretch, place in the tile (3), tile (2), world distance stepped back); not ok
-    where the surface has no usable frame.
+    (ok, first patch, variants, M (9), patch units per metre along the normal, place in the tile (3), tile (2), world
+    distance stepped back); not ok where the surface has no usable frame.
     """
     row = macro.fabrics[material]
     first, count = int(row[FIRST_PATCH]), int(row[VARIANTS])
@@ -62,9 +62,10 @@ def enter_slab(macro, patches, material, tx, ty, nx, ny, nz, faces, frame, dx, d
     norm = math.sqrt(mx * mx + my * my + mz * mz)
     if norm > 0.0:
         mx, my, mz = mx / norm, my / norm, mz / norm
-    # The interpolated normal must see the ray from the same side as the triangle does, and not at a grazing angle.
+    # The interpolated normal must see the ray from the same side as the triangle does, not at a grazing angle, and must
+    # not lie in the triangle.
     across = dx * mx + dy * my + dz * mz
-    if norm <= 0.0 or across * faces <= 0.0 or abs(across) < 0.02:
+    if norm <= 0.0 or across * faces <= 0.0 or abs(across) < 0.02 or abs(mx * nx + my * ny + mz * nz) < 0.1:
         mx, my, mz, across = nx, ny, nz, faces
     # Gradients in the plane normal to it.
     gx, gy, gz, hx, hy, hz = frame[3], frame[4], frame[5], frame[6], frame[7], frame[8]

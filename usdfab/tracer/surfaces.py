@@ -99,8 +99,8 @@ def surface_frame(macro, time, prim, copy, u, v):
         e1 += k * macro.faces[key, prim, 1]
         e2 += k * macro.faces[key, prim, 2]
     if copy >= 0:
-        # Normals and gradients are covectors: they go by the inverse transpose. The cloth grows with the copy, so that
-        # its gradients are divided by nothing but the rotation and shear that are left.
+        # Normals and gradients are covectors: they go by the inverse transpose. The cloth is fixed to the copy, as it
+        # is where the same mesh is written out in the world: yarns grow with a copy that is larger.
         a = macro.placements
         k0, k1 = 1.0 - late, late
         last = a.shape[0] - 1
@@ -119,7 +119,7 @@ def surface_frame(macro, time, prim, copy, u, v):
         c20, c21, c22 = m01 * m12 - m02 * m11, m02 * m10 - m00 * m12, m00 * m11 - m01 * m10
         det = m00 * c00 + m01 * c01 + m02 * c02
         sign = math.copysign(1.0, det)
-        grow = abs(det) ** (1.0 / 3.0) / det
+        inverse = sign / max(abs(det), 1e-300)
         n0, n1, n2 = (
             sign * (c00 * n0 + c01 * n1 + c02 * n2),
             sign * (c10 * n0 + c11 * n1 + c12 * n2),
@@ -131,14 +131,14 @@ def surface_frame(macro, time, prim, copy, u, v):
             sign * (c20 * e0 + c21 * e1 + c22 * e2),
         )
         g0, g1, g2 = (
-            grow * (c00 * g0 + c01 * g1 + c02 * g2),
-            grow * (c10 * g0 + c11 * g1 + c12 * g2),
-            grow * (c20 * g0 + c21 * g1 + c22 * g2),
+            inverse * (c00 * g0 + c01 * g1 + c02 * g2),
+            inverse * (c10 * g0 + c11 * g1 + c12 * g2),
+            inverse * (c20 * g0 + c21 * g1 + c22 * g2),
         )
         h0, h1, h2 = (
-            grow * (c00 * h0 + c01 * h1 + c02 * h2),
-            grow * (c10 * h0 + c11 * h1 + c12 * h2),
-            grow * (c20 * h0 + c21 * h1 + c22 * h2),
+            inverse * (c00 * h0 + c01 * h1 + c02 * h2),
+            inverse * (c10 * h0 + c11 * h1 + c12 * h2),
+            inverse * (c20 * h0 + c21 * h1 + c22 * h2),
         )
     norm = 1.0 / math.sqrt(max(e0 * e0 + e1 * e1 + e2 * e2, 1e-300))
     uv = macro.uv

@@ -71,8 +71,9 @@ class Mesh:
     face_material: (T,) int32
         Index into ``Scene.materials``.
     placements: (K, 3, 4) or None
-        Copies of the mesh: local to world in metres. None: one copy, ``points`` are in world space. Metres of cloth are
-        those of ``points`` before placement times the placement's scale: yarns keep their size where a copy is larger.
+        Copies of the mesh: local to world in metres. None: one copy, ``points`` are in world space. A copy looks as if
+        its placed points were a mesh of their own with the same ``uv``: a point of the cloth is ``uv * meters_per_uv``
+        whatever the placement's scale, so that yarns grow with a copy that is larger.
     points_close: (V, 3) or None
         ``points`` at the shutter's closing, where they move while it is open; straight lines between.
     placements_close: (K, 3, 4) or None
