@@ -137,7 +137,7 @@ def test_furnace_at_a_grazing_angle():
     angle = math.radians(88.0)
     scene = scenes.scene([plane(10.0)], [cloth_material()], [dome()], [WHITE])
     eye = 0.3 * np.array([0.1, -math.sin(angle), math.cos(angle)])
-    check(scene, look(eye, (0, 0, 0), (1e-2, 1e-2), up=(0, 0, 1)), 200)
+    check(scene, look(eye, (0, 0, 0), (1e-2, 1e-2), up=(0, 0, 1)), 300)
 
 
 def test_furnace_with_opposed_normals_and_interpenetration():

@@ -380,8 +380,10 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
         if bsdf_pdf <= 0.0 or beta_r + beta_g + beta_b <= 0.0:
             break
         if depth >= RUSSIAN_ROULETTE_DEPTH:
-            # No bound below 1: it would let the throughput of long paths in white surroundings grow for ever.
-            survive = min(1.0, 0.95 * max(beta_r, beta_g, beta_b))
+            # One path in twenty ends at each vertex at least, which costs less noise than long tails cost time. In white
+            # surroundings throughput would then grow for ever: from 2 on it is held.
+            beta = max(beta_r, beta_g, beta_b)
+            survive = min(beta, max(0.95, 0.5 * beta), 1.0)
             stream, u0 = next_uniform(stream)
             if u0 >= survive:
                 break
