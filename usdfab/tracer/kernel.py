@@ -380,8 +380,8 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
         if bsdf_pdf <= 0.0 or beta_r + beta_g + beta_b <= 0.0:
             break
         if depth >= RUSSIAN_ROULETTE_DEPTH:
-            # One path in twenty ends at each vertex at least, which costs less noise than long tails cost time. In white
-            # surroundings throughput would then grow for ever: from 2 on it is held.
+            # At least one path in twenty ends at each vertex: that costs less noise than long tails cost time. In white
+            # surroundings throughput would then grow for ever, so it is held at 2.
             beta = max(beta_r, beta_g, beta_b)
             survive = min(beta, max(0.95, 0.5 * beta), 1.0)
             stream, u0 = next_uniform(stream)
