@@ -63,7 +63,7 @@ def test_furnace_on_curved_cloth(shape):
 
         mesh = scenes.sheet(point, lambda a, b: np.stack([0.12 * a, 0.06 * b], axis=-1), 32, 16)
     scene = scenes.scene([mesh], [cloth_material()], [dome()], [fabric(albedo=(1, 1, 1))])
-    check_furnace(scene, look((0.01, -0.05, 0.1), (0, 0, 0.01), (0.1, 0.1)), 128 if shape == "strip" else 1000)
+    check_furnace(scene, look((0.01, -0.05, 0.1), (0, 0, 0.01), (0.1, 0.1)), 192 if shape == "strip" else 1000)
 
 
 # --- radiometry on a diffuse plane -----------------------------------------------------------------------------------

@@ -39,9 +39,9 @@ from usdfab.tracer.textures import lookup, normal_at, opacity_at, surface_at
 from usdfab.tracer.world import ALBEDO_MAP, FIRST_CURVE, FIRST_PATCH, FIRST_SEGMENT, MATERIAL, YARN, borrowed
 
 RUSSIAN_ROULETTE_DEPTH = 5
-SHADOW_ROULETTE = 2.0 * math.pi
-"""From the second vertex on, light that would arrive with less than half of what isotropic scattering gives gets its
-shadow ray by chance only.
+SHADOW_ROULETTE = 4.0 * math.pi
+"""From the second vertex on, light that would arrive with less than what isotropic scattering gives gets its shadow
+ray by chance only.
 
 Fibers scatter into narrow lobes: at most vertices next to nothing goes towards a lamp, and the few that matter make the
 noise. So the rays that are saved here (nine of ten) cost hardly any variance.
