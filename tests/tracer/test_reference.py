@@ -39,8 +39,6 @@ def test_fast_equals_reference_closely(name, depth, spp, monkeypatch):
 
 
 def check(name, depth, spp, side, monkeypatch):
-    # The reference has a segment between any two knots: leaving out knots changes the mean by 0.2 to 0.3 %.
-    monkeypatch.setattr("usdfab.tracer.patch_scene.BEND", 1e-9)
     monkeypatch.setattr(render_module, "build_tiles", lambda cloth: [build_patch_scene(cloth, PATCH)])
     light = LIGHTS[name]
     scene, camera = swatch(CLOTH, *([light] if light else []), zoom=0.3)

@@ -12,7 +12,7 @@ from scenes import cloth_material, dome, fabric, look, plane
 
 from usdfab.fibers import generate_patch
 from usdfab.tracer import RenderSettings, Tracer
-from usdfab.tracer.patch_scene import BEND, tile_copies
+from usdfab.tracer.patch_scene import tile_copies
 from usdfab.tracer.reference import reference_fibers, trace
 from usdfab.usd.scene import DistantLight
 
@@ -87,8 +87,8 @@ def test_rays_meet_the_fibers_of_the_mapped_cloth(name, below):
             normal = whole.T @ across
             normals.append(render.normal[0, 0] @ normal / np.linalg.norm(normal))
     assert 0.1 < seen / count < 0.98
-    assert same >= 0.96 * count  # silhouettes: chords of several knots there, of one knot here
-    assert np.median(errors) < BEND and np.mean(np.array(errors) < 0.2) > 0.95
+    assert same >= 0.97 * count  # silhouettes: chords of several knots there, of one knot here
+    assert np.median(errors) < 0.03 and np.mean(np.array(errors) < 0.2) > 0.95
     assert np.median(normals) > 0.999 and np.mean(np.array(normals) > 0.98) > 0.9
 
 
@@ -149,12 +149,12 @@ def test_rotated_uv_is_a_rotated_world():
         pictures.append(Tracer(scene).render(camera, replace(settings, seed=seed)))
 
     def blocks(image):
-        return image.reshape(4, 8, 4, 8, -1).mean(axis=(1, 3), dtype=float)
+        return image.reshape(8, 4, 8, 4, -1).mean(axis=(1, 3), dtype=float)
 
     a, b = pictures
-    z = (blocks(a.pixels) - blocks(b.pixels)) / np.sqrt((blocks(a.variance) + blocks(b.variance)) / 64)
+    z = (blocks(a.pixels) - blocks(b.pixels)) / np.sqrt((blocks(a.variance) + blocks(b.variance)) / 16)
     assert np.sqrt(np.mean(z**2)) < 1.5
-    assert np.std(blocks(a.pixels)[..., 0]) > 0.005  # there is something to compare
+    assert np.std(blocks(a.pixels)[..., 0]) > 0.01  # there is something to compare
 
 
 @pytest.mark.parametrize("seam", ["zero uv area", "no area", "opposed"])
