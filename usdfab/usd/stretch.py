@@ -44,12 +44,6 @@ class Stretch:
         with np.errstate(divide="ignore"):
             return np.maximum(self.s1, 1.0 / self.s2)
 
-    @property
-    def signed(self) -> Array:
-        """(T,) the singular value that is farther from 1: above 1 drawn out, below 1 pushed together."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(self.s1 * self.s2 >= 1.0, self.s1, self.s2)
-
 
 def measure(points: Array, uv: Array, meters_per_uv: float) -> Stretch:
     """The stretch of triangles.
@@ -205,3 +199,30 @@ def _report(
         spread(found.s1, area), spread(finite, area), spread(found.s1 * finite, area), spread(found.shear, area),
         limit, share(found.stretch > limit), share(found.mirrored & ~degenerate), share(degenerate),
     )  # fmt: skip
+
+
+def warnings(report: SurfaceReport) -> list[str]:
+    """What people should know of a surface before they render it, one sentence each."""
+    found = []
+    if report.above > 0 and report.stretch_max and report.stretch_min:
+        worst = f"{report.stretch_min.min:.3g} to {report.stretch_max.max:.3g} times"
+        area = f"{_percent(report.above)} of the area ({report.above * report.area * 1e4:.3g} cm^2)"
+        found.append(
+            f"{report.mesh}: {area} is drawn out or pushed together by more than {report.limit:g} "
+            f"(yarns are {worst} as long as they should be)"
+        )
+    if report.mirrored > 0:
+        found.append(
+            f"{report.mesh}: {_percent(report.mirrored)} of the area has mirrored texture coordinates: its weave runs "
+            "the other way round"
+        )
+    if report.degenerate > 0:
+        found.append(
+            f"{report.mesh}: {_percent(report.degenerate)} of the area has no area in its texture coordinates, there "
+            "are no yarns to be seen"
+        )
+    return found
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.3g} %"
