@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from usdfab.fabric.fabric import SYSTEMS, FabricParameters, System
-from usdfab.fabric.parameters import PARAMETER_BY_NAME
+from usdfab.fabric.parameters import PARAMETER_BY_NAME, YARN_PARAMETERS
 from usdfab.fabric.plies import ply_fill
 
 DENSEST = math.pi / (2.0 * math.sqrt(3.0))
@@ -37,6 +37,25 @@ def doubts(fabric: FabricParameters) -> list[Doubt]:
     """Everything about ``fabric`` that no real cloth has; empty for a plausible one."""
     found = [doubt for system in SYSTEMS for doubt in _system_doubts(fabric, system)]
     return found + list(_crossings(fabric))
+
+
+def unusual(fabric: FabricParameters) -> list[Doubt]:
+    """Values outside of the table's ``soft`` range, where real fabrics lie; parameters that are not in use are not."""
+    found = []
+    for system in SYSTEMS:
+        yarn = fabric.system(system)
+        idle = {"count", "fiber_radius", *(() if yarn.fiber_radius == 0 else ("packing",))}
+        idle |= {"ply_twist"} if yarn.ply_count == 1 else set()
+        idle |= set() if yarn.flyaway_density else {p.name for p in YARN_PARAMETERS if p.name.startswith("flyaway_")}
+        for p in YARN_PARAMETERS:
+            if p.kind in ("color", "colors") or p.name in idle:
+                continue
+            value, (low, high) = getattr(yarn, p.name), p.soft
+            if not low <= value <= high:
+                unit = "" if p.unit == "1" else f" {p.unit}"
+                message = f"{value:g}{unit} is unusual; real fabrics have {low:g} to {high:g}"
+                found.append(Doubt("unusual", system, p.name, message, ""))
+    return found
 
 
 def fiber_fill(fabric: FabricParameters, system: System) -> float:

@@ -8,13 +8,13 @@ from pathlib import Path
 from pxr import Sdf, Tf, Usd
 
 from usdfab.errors import UsdfabError
-from usdfab.fabric.plausible import doubts
-from usdfab.usd.check_assets import bindings, known_missing, missing_files
+from usdfab.fabric.plausible import doubts, unusual
+from usdfab.usd.check_assets import bindings, missing_files
 from usdfab.usd.check_rules import applied, cloth, curves, preview, values
 from usdfab.usd.check_schema import names, primvars, tokens, types
 from usdfab.usd.check_usd import composition_issues, plain, quiet_usd, validator_issues
 from usdfab.usd.fabric_io import fabric_from_prim, is_fabric
-from usdfab.usd.issue import SEVERITIES, Issue, Severity, warning
+from usdfab.usd.issue import SEVERITIES, Issue, Severity, info, warning
 from usdfab.usd.schema_source import camel, yarn_attribute_name
 from usdfab.usd.stage import open_stage, site, stage_name
 
@@ -30,7 +30,10 @@ _UNREADABLE = (
 
 
 def plausible(prim: Usd.Prim) -> Iterator[Issue]:
-    """``usdfab:cover``, ``interpenetration``, ``packing``, ``fiberRadius``, ``crimp``: cloth that cannot exist."""
+    """``usdfab:cover``, ``interpenetration``, ``packing``, ``fiberRadius``, ``crimp``: cloth that cannot exist.
+
+    ``usdfab:unusual`` for values that few fabrics have.
+    """
     if not is_fabric(prim) or prim.GetTypeName() != "Material":
         return
     try:
@@ -41,6 +44,9 @@ def plausible(prim: Usd.Prim) -> Iterator[Issue]:
     for doubt in doubts(fabric):
         place = prim.GetPath().AppendProperty(yarn_attribute_name(doubt.system, camel(doubt.parameter)))
         yield warning(place, prim, doubt.rule, doubt.message, doubt.remedy)
+    for doubt in unusual(fabric):
+        place = prim.GetPath().AppendProperty(yarn_attribute_name(doubt.system, camel(doubt.parameter)))
+        yield info(place, prim, doubt.rule, doubt.message)
 
 
 RULES: tuple[Callable[[Usd.Prim], Iterator[Issue]], ...] = (
@@ -64,7 +70,6 @@ def check(source: str | Path | Usd.Stage) -> list[Issue]:
     with quiet_usd():
         stage = open_stage(source)
         issues = _guarded(lambda: composition_issues(stage), stage_name(stage))
-        missing: set[str] = {path for issue in issues for path in _between_at_signs(issue.message)}
         for prim in prims(stage):
             place = site(stage, prim)
             for rule in RULES:
@@ -73,8 +78,7 @@ def check(source: str | Path | Usd.Stage) -> list[Issue]:
                 text = f"more than {MAX_ISSUES} findings, the rest of the stage is not checked"
                 issues.append(Issue("warning", stage_name(stage), "usdfab:many", text))
                 break
-        missing |= {path for issue in issues if issue.rule == "usdfab:asset" for path in known_missing(issue)}
-        issues += _guarded(lambda: validator_issues(stage, missing), stage_name(stage))
+        issues += _guarded(lambda: validator_issues(stage, issues), stage_name(stage))
     return sorted(dict.fromkeys(issues), key=lambda i: (SEVERITIES.index(i.severity), i.site, i.rule))
 
 
@@ -111,8 +115,3 @@ def _guarded(rule: Callable[[], Iterator[Issue]], place: str) -> list[Issue]:
         reason = plain(str(error)) or type(error).__name__
         found.append(Issue("error", place, "usdfab:unreadable", f"USD cannot read what is here ({reason})"))
     return found
-
-
-def _between_at_signs(message: str) -> list[str]:
-    """The files that a message of USD names: ``@file@``."""
-    return message.split("@")[1::2]

@@ -36,12 +36,6 @@ def missing_files(prim: Usd.Prim) -> Iterator[Issue]:
                     yield warning(attribute, prim, "absolute", message, "write it relative to the layer")
 
 
-def known_missing(issue: Issue) -> list[str]:
-    """The absolute path of the file that an issue of ``missing_files`` is about, as USD's own validator names it."""
-    match = re.search(r"\((.*)\)$", issue.message)
-    return [match[1]] if match else []
-
-
 def absolute(attribute: Usd.Attribute, path: Sdf.AssetPath) -> str:
     """The path seen from the layer that names it."""
     stack = attribute.GetPropertyStack(Usd.TimeCode.EarliestTime())
@@ -60,7 +54,7 @@ def is_missing(attribute: Usd.Attribute, path: Sdf.AssetPath) -> bool:
 
 
 def bindings(prim: Usd.Prim) -> Iterator[Issue]:
-    """``usdfab:binding``: material bindings whose material or collection does not exist."""
+    """``usdfab:binding``: material bindings whose material or collection does not exist or is none."""
     stage = prim.GetStage()
     for relationship in prim.GetAuthoredRelationships():
         if not relationship.GetName().startswith(UsdShade.Tokens.materialBinding):
@@ -76,6 +70,9 @@ def bindings(prim: Usd.Prim) -> Iterator[Issue]:
                     "is a reference missing, or a name misspelt?",
                 )
                 yield error(relationship, prim, "binding", message, remedy)
+            elif path.IsPrimPath() and not found.IsA(UsdShade.Material):
+                kind = found.GetTypeName() or "prim without type"
+                yield error(relationship, prim, "binding", f"bound to {path}, a {kind}", "bind a Material")
             elif path.IsPropertyPath() and path.name.startswith("collection:"):
                 names = [f"collection:{c.GetName()}" for c in Usd.CollectionAPI.GetAll(found)]
                 if path.name not in names:

@@ -44,7 +44,8 @@ def names(prim: Usd.Prim) -> Iterator[Issue]:
         return
     declared = {name for name, _ in attributes(prim)}
     for name in authored:
-        if name in declared:
+        # Those of a yarn system that is not applied are told as that.
+        if name in declared or name in _TYPES:
             continue
         near = difflib.get_close_matches(name, sorted(_TYPES), n=1, cutoff=0.75)
         remedy = f"is {near[0]} meant?" if near and near[0] != name else "take it out, or write it with userProperties:"
@@ -62,7 +63,7 @@ def types(prim: Usd.Prim) -> Iterator[Issue]:
         wrong = [s for s in specs if isinstance(s, Sdf.AttributeSpec) and str(s.typeName) != attribute.type_name]
         if wrong:
             text = f"authored as {wrong[0].typeName} in {wrong[0].layer.GetDisplayName()}"
-            yield warning(found, prim, "type", text, f"the schema's type is {attribute.type_name}")
+            yield error(found, prim, "type", text, f"the schema's type is {attribute.type_name}")
 
 
 def tokens(prim: Usd.Prim) -> Iterator[Issue]:

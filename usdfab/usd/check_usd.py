@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from pxr import Pcp, Tf, Usd, UsdUtils, UsdValidation
@@ -34,11 +34,8 @@ def quiet_usd() -> Iterator[None]:
         del delegate
 
 
-def validator_issues(stage: Usd.Stage, known: set[str]) -> Iterator[Issue]:
-    """What UsdValidation's validators find; missing files that are ``known`` (absolute paths) are left out.
-
-    Composition errors are those of :func:`composition_issues`.
-    """
+def validator_issues(stage: Usd.Stage, ours: Sequence[Issue]) -> Iterator[Issue]:
+    """What UsdValidation's validators find, without what ``ours``, the rules' own issues, say already."""
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     kinds = UsdValidation.ValidationErrorType
     severities: dict[object, Severity] = {kinds.Error: "error", kinds.Warn: "warning", kinds.Info: "info"}
@@ -49,11 +46,9 @@ def validator_issues(stage: Usd.Stage, known: set[str]) -> Iterator[Issue]:
         # usd-core 25.11 ships no definitions of USD's own shaders and says so, once, by an exception.
         errors = context.Validate(stage)
     for error in errors:
-        if error.HasNoError() or _false_alarm(error) or error.GetName() == "CompositionError":
+        if error.HasNoError() or _false_alarm(error) or _told(error, ours):
             continue
         message = plain(error.GetMessage())
-        if error.GetName() == "UnresolvableDependency" and any(f"'{path}'" in message for path in known):
-            continue
         severity = severities.get(error.GetType(), "info")
         remedy = _REMEDIES.get(error.GetName(), "")
         yield Issue(severity, _first_site(stage, error), str(error.GetIdentifier()), message, remedy)
@@ -76,6 +71,20 @@ def plain(text: str) -> str:
 
 def _false_alarm(error: UsdValidation.ValidationError) -> bool:
     return error.GetName() == "MissingShaderIdInRegistry" and any(name in error.GetMessage() for name in _SHADERS)
+
+
+def _told(error: UsdValidation.ValidationError, ours: Sequence[Issue]) -> bool:
+    """Whether an issue of a rule says the same, with more of a place: files, bindings, types, composition errors."""
+    name, message = error.GetName(), error.GetMessage()
+    if name == "CompositionError":
+        return True
+    if name == "UnresolvableDependency":
+        files = re.findall(r"'([^']+)'", message)
+        told = [issue.message for issue in ours if issue.rule in (COMPOSITION, "usdfab:asset")]
+        return any(f"@{file}@" in text or f"({file})" in text for file in files for text in told)
+    rule = {"InvalidResourcePath": "usdfab:binding", "AttributeTypeMismatch": "usdfab:type"}.get(name)
+    places = {issue.site.rpartition("<")[2] for issue in ours if issue.rule == rule}
+    return any(f"<{place}" in message for place in places)
 
 
 def _first_site(stage: Usd.Stage, error: UsdValidation.ValidationError) -> str:

@@ -44,3 +44,8 @@ def warning(
 ) -> Issue:
     """Something that works, though probably not as it was meant."""
     return Issue("warning", site(prim.GetStage(), where), f"usdfab:{rule}", message, remedy)
+
+
+def info(where: Usd.Prim | Usd.Property | Sdf.Path, prim: Usd.Prim, rule: str, message: str) -> Issue:
+    """Something worth a look."""
+    return Issue("info", site(prim.GetStage(), where), f"usdfab:{rule}", message)
