@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import preset
@@ -392,6 +392,51 @@ def test_one_of_several_fabrics(one, tmp_path):
         bind(one, path, tmp_path / "b.usda")
     assert bind(one, path, tmp_path / "b.usda", material="/Looks/Linen").material == "/World/Looks/Linen"
     assert fabrics_of(tmp_path / "b.usda") == {"/World/Cloth": {"LinenPlain"}}
+
+
+def test_a_colourway_is_selected(one, fabric_file, tmp_path):
+    stage = Usd.Stage.Open(str(fabric_file))
+    prim = stage.GetPrimAtPath("/Looks/Fabric")
+    looks = prim.GetVariantSets().AddVariantSet("look")
+    for name, seed in (("navy", 5), ("red", 6)):
+        looks.AddVariant(name)
+        looks.SetVariantSelection(name)
+        prim.GetAttribute("usdfab:seed").Clear()
+        with looks.GetVariantEditContext():
+            prim.GetAttribute("usdfab:seed").Set(seed)
+    looks.ClearVariantSelection()
+    stage.GetRootLayer().Save()
+    bind(one, fabric_file, tmp_path / "b.usda", variants={"look": "red"})
+    assert read_scene(tmp_path / "b.usda").fabrics[0].fabric.seed == 6
+    for variants, problem in (({"size": "big"}, "no variant set 'size'; it has look"), ({"look": "x"}, "navy, red")):
+        with pytest.raises(UsdfabError, match=problem):
+            bind(one, fabric_file, tmp_path / "c.usda", variants=variants)
+    assert not (tmp_path / "c.usda").exists()
+
+
+def test_packages(one, fabric_file, tmp_path):
+    cloth, fabric = tmp_path / "cloth.usdz", tmp_path / "fabric.usdz"
+    assert UsdUtils.CreateNewUsdzPackage(str(one), str(cloth))
+    assert UsdUtils.CreateNewUsdzPackage(str(fabric_file), str(fabric))
+    bind(cloth, fabric, tmp_path / "b.usda")
+    assert fabrics_of(tmp_path / "b.usda") == {"/World/Cloth": {"Denim"}}
+    assert check(tmp_path / "b.usda") == []
+
+
+def test_what_payloads_and_variants_bring_is_bound(make, new_mesh, fabric_file, tmp_path):
+    make(lambda s: new_mesh(s, "/World/Cloth", SQUARE, QUAD, UV), "part.usdc")
+
+    def build(stage):
+        prim = UsdGeom.Xform.Define(stage, "/World/Part").GetPrim()
+        size = prim.GetVariantSets().AddVariantSet("size")
+        size.AddVariant("large")
+        size.SetVariantSelection("large")
+        with size.GetVariantEditContext():
+            prim.GetPayloads().AddPayload("./part.usdc")
+
+    bound = bind(make(build), fabric_file, tmp_path / "b.usda")
+    assert bound.targets == ("/World/Part/Cloth",)
+    assert fabrics_of(tmp_path / "b.usda") == {"/World/Part/Cloth": {"Denim"}}
 
 
 # --- what is refused ---

@@ -234,7 +234,8 @@ TYPES = ["bool", "int", "float", "double2", "string", "token", "asset", "int[]",
          "quath", "double", "timecode[]", "asset[]"]  # fmt: skip
 NAMES = ["usdfab:weave:size", "usdfab:weave:matrix", "usdfab:schemaVersion", "usdfab:sampleSize", "usdfab:seed",
          "usdfab:albedoMap", "usdfab:name", "usdfab:yarn:warp:count", "usdfab:yarn:weft:albedo",
-         "primvars:usdfab:scale", "primvars:st", "points", "faceVertexCounts", "faceVertexIndices", "extent", "widths", "curveVertexCounts",
+         "primvars:usdfab:scale", "primvars:st",
+         "points", "faceVertexCounts", "faceVertexIndices", "extent", "widths", "curveVertexCounts",
          "orientation", "subdivisionScheme", "material:binding", "usdfab:provenance:stages", "usdfab:"]  # fmt: skip
 
 

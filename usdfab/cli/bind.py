@@ -30,6 +30,9 @@ def run(
     ] = None,
     all_: Annotated[bool, Parameter(name="--all", negative="", help="Bind every mesh that looks like cloth.")] = False,
     material: Annotated[str | None, Parameter(help="Material path, where the fabric file holds several.")] = None,
+    variant: Annotated[
+        list[str] | None, Parameter(negative="", help="SET=NAME of the fabric, e.g. a colourway; several times.")
+    ] = None,
     rotate: Annotated[float | None, Parameter(help="Turn the fabric by so many degrees, from u towards v.")] = None,
     scale: Annotated[float | None, Parameter(help="Yarns so many times larger than life.")] = None,
     meters_per_uv: Annotated[
@@ -81,6 +84,7 @@ def run(
         collections=collection or (),
         every=all_,
         material=material,
+        variants=_selections(variant or []),
         rotate=rotate,
         scale=scale,
         meters_per_uv=None if meters_per_uv is None else parse_length(meters_per_uv),
@@ -107,6 +111,16 @@ def run(
         for warning in warnings:
             say(f"warning: {warning}")
         say(f"wrote {output}: {bound.material} on {', '.join(bound.targets)}")
+
+
+def _selections(texts: list[str]) -> dict[str, str]:
+    from usdfab.errors import UsdfabError
+
+    pairs = [text.partition("=") for text in texts]
+    for text, (name, _, chosen) in zip(texts, pairs, strict=True):
+        if not name or not chosen:
+            raise UsdfabError(f"'{text}' is no selection", place="--variant", remedy="write for example look=navy")
+    return {name: chosen for name, _, chosen in pairs}
 
 
 def _measured(bound: Bound, limit: float) -> tuple[Scene | None, list[Surface], list[str]]:

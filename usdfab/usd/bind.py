@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,6 +53,7 @@ def bind(
     collections: Sequence[str] = (),
     every: bool = False,
     material: str | None = None,
+    variants: Mapping[str, str] | None = None,
     rotate: float | None = None,
     scale: float | None = None,
     meters_per_uv: float | None = None,
@@ -70,6 +71,8 @@ def bind(
     prims, collections:
         Prim paths (meshes, subsets of faces, anything that holds meshes) and collections (``/Prim.collection:name``).
         Without either: the only mesh that looks like cloth, or with ``every`` all that do.
+    variants:
+        Selections of the Material's variant sets, e.g. of a colourway.
     rotate: degrees
         Turns the fabric from u towards v. None authors nothing.
     scale:
@@ -98,6 +101,7 @@ def bind(
     with atomic_path(out, overwrite=overwrite) as temporary:
         stage, warnings = _new_layer(base, temporary)
         writer = _Writer(stage, relative_asset(fabric, temporary.parent), origin.GetPath())
+        writer.select(variants or {})
         for target in targets:
             writer.bind(target, stronger=stronger, rotate=rotate, scale=scale)
         if meters_per_uv is not None:
@@ -177,6 +181,20 @@ class _Writer:
         prim = UsdShade.Material.Define(self.stage, scope.AppendChild(name)).GetPrim()
         prim.GetReferences().AddReference(asset, origin)
         return UsdShade.Material(prim)
+
+    def select(self, variants: Mapping[str, str]) -> None:
+        """Author selections of the Material's variant sets."""
+        prim = self.material.GetPrim()
+        for name, chosen in variants.items():
+            known = prim.GetVariantSets().GetNames()
+            if name not in known:
+                remedy = f"it has {', '.join(known)}" if known else "it has none"
+                raise UsdfabError(f"the fabric has no variant set '{name}'", place="variant", remedy=remedy)
+            there = prim.GetVariantSet(name).GetVariantNames()
+            if chosen not in there:
+                remedy = f"use one of {', '.join(there)}"
+                raise UsdfabError(f"the variant set '{name}' has no '{chosen}'", place="variant", remedy=remedy)
+            prim.GetVariantSet(name).SetVariantSelection(chosen)
 
     def _scope(self) -> Sdf.Path:
         """Where materials are kept: in the default prim, so that they travel with it."""

@@ -113,5 +113,5 @@ def _guarded(rule: Callable[[], Iterator[Issue]], place: str) -> list[Issue]:
         found.append(Issue("error", error.place or place, "usdfab:unreadable", error.problem, error.remedy))
     except _UNREADABLE as error:
         reason = plain(str(error)) or type(error).__name__
-        found.append(Issue("error", place, "usdfab:unreadable", f"USD cannot read what is here ({reason})"))
+        found.append(Issue("error", place, "usdfab:unreadable", f"a value here is not what it should be ({reason})"))
     return found

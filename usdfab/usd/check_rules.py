@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Iterator
 
 import numpy as np
@@ -53,7 +54,8 @@ def values(prim: Usd.Prim) -> Iterator[Issue]:
     if not is_fabric(prim) or prim.GetTypeName() != "Material":
         return
     wrong = False
-    version = prim.GetAttribute(fabric_attribute_name("schemaVersion")).Get() or SCHEMA_VERSION
+    version = prim.GetAttribute(fabric_attribute_name("schemaVersion")).Get()
+    version = version if isinstance(version, int) else SCHEMA_VERSION
     for name, attribute in attributes(prim):
         path = prim.GetPath().AppendProperty(name)
         usd_attribute = prim.GetAttribute(name)
@@ -67,14 +69,9 @@ def values(prim: Usd.Prim) -> Iterator[Issue]:
         if problem:
             wrong = True
             yield error(path, prim, "value", problem)
-    size = prim.GetAttribute(fabric_attribute_name("weave:size"))
-    matrix = prim.GetAttribute(fabric_attribute_name("weave:matrix"))
-    if size and matrix and size.Get() is not None and matrix.Get() is not None:
-        picks, ends = size.Get()
-        if picks * ends != len(matrix.Get()):
-            wrong = True
-            message = f"the matrix has {len(matrix.Get())} values, the size {picks} x {ends} asks for {picks * ends}"
-            yield error(matrix, prim, "weaveSize", message)
+    for issue in _weave_size(prim) if not wrong else ():
+        wrong = True
+        yield issue
     if not wrong and set(yarn_instances(prim)) >= {"warp", "weft"}:
         try:
             fabric_from_prim(prim)
@@ -82,6 +79,18 @@ def values(prim: Usd.Prim) -> Iterator[Issue]:
         except UsdfabError as found:
             place = found.place or site(prim.GetStage(), prim)
             yield Issue("error", place, "usdfab:fabric", found.problem, found.remedy)
+
+
+def _weave_size(prim: Usd.Prim) -> Iterator[Issue]:
+    matrix = prim.GetAttribute(fabric_attribute_name("weave:matrix"))
+    size = np.atleast_1d(prim.GetAttribute(fabric_attribute_name("weave:size")).Get())
+    number = np.size(matrix.Get())
+    if size.shape != (2,):
+        yield error(prim, prim, "weaveSize", f"expected two numbers, got {size.size}")
+    elif number != int(size[0]) * int(size[1]):
+        picks, ends = map(int, size)
+        message = f"the matrix has {number} values, the size {picks} x {ends} asks for {picks * ends}"
+        yield error(matrix, prim, "weaveSize", message)
 
 
 def attributes(prim: Usd.Prim) -> Iterator[tuple[str, SchemaAttribute]]:
@@ -96,18 +105,17 @@ def attributes(prim: Usd.Prim) -> Iterator[tuple[str, SchemaAttribute]]:
 
 def _value_problem(attribute: SchemaAttribute, value: object) -> str:
     """What is wrong with a value, or an empty string."""
-    if attribute in YARN_ATTRIBUTES:
-        try:
-            checked_value(PARAMETER_BY_NAME[attribute.field], value)
-        except UsdfabError as found:
-            return found.problem
-        return ""
-    if attribute.hard is None:
-        return ""
     try:
+        if attribute in YARN_ATTRIBUTES:
+            checked_value(PARAMETER_BY_NAME[attribute.field], value)
+            return ""
+        if attribute.hard is None:
+            return ""
         numbers = np.atleast_1d(np.asarray(value, dtype=float))
+    except UsdfabError as found:
+        return found.problem
     except (TypeError, ValueError):
-        return f"expected a value of type {attribute.type_name}"
+        return f"expected a value of type {attribute.type_name}, got {reprlib.repr(value)}"
     low, high = attribute.hard
     bad = numbers[~(np.isfinite(numbers) & (numbers >= low) & (numbers <= high))]
     return f"{bad[0]:g} is not between {low:g} and {high:g}" if len(bad) else ""
