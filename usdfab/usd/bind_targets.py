@@ -191,7 +191,7 @@ def default_targets(stage: Usd.Stage, *, every: bool) -> list[Target]:
         raise UsdfabError("there is no visible mesh in this stage", place=stage_name(stage))
     if len(found) > 1 and not every:
         remedy = f"choose with --prim, or bind all with --all: {listed(str(p.GetPath()) for p in found)}"
-        raise UsdfabError(f"which of {len(found)} meshes is cloth?", place=stage_name(stage), remedy=remedy)
+        raise UsdfabError(f"{len(found)} meshes could be cloth", place=stage_name(stage), remedy=remedy)
     return [Target(p, meshes_below(p)) for p in found]
 
 

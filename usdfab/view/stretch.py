@@ -136,13 +136,15 @@ def _camera(pv: Any, plotter: Any, surfaces: Sequence[Surface], up_axis: str, si
     """A view from the side to which the cloth faces, from above, and light from that side."""
     up = np.array([0.0, 0.0, 1.0] if up_axis == "Z" else [0.0, 1.0, 0.0])
     corners = np.concatenate([s.points for s in surfaces])
-    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    # The mean direction: of length 1 for a flat cloth, 0 for a closed surface.
+    facing = normals.sum(axis=0) / np.linalg.norm(normals, axis=1).sum()
     front = facing - (facing @ up) * up
-    if np.linalg.norm(front) <= 0.3 * np.linalg.norm(facing):
+    if np.linalg.norm(front) <= 0.1:
         # Cloth that lies flat, or faces all around, is seen from the front of the stage.
         front = np.array([0.0, -1.0, 0.0] if up_axis == "Z" else [0.0, 0.0, 1.0])
     front = front / np.linalg.norm(front)
-    below = -1.0 if facing @ up < -0.7 * np.linalg.norm(facing) else 1.0
+    below = -1.0 if facing @ up < -0.5 else 1.0
     side = np.cross(up, front)
     a, e = math.radians(AZIMUTH), below * math.radians(ELEVATION)
     back = math.cos(e) * (math.cos(a) * front + math.sin(a) * side) + math.sin(e) * up
