@@ -198,6 +198,9 @@ class Resolver:
         # As large as the first copy, but not turned as it is: the charts of a mesh that moves stay what they are.
         stretch = _stretch(first.to_world[0])
         uv = unwrap_faces(cage.rest @ stretch, cage.topology.counts, cage.topology.indices)
+        if cage.left_handed != (np.linalg.det(first.to_world[0, :3, :3]) < 0):
+            # The front is where the faces run clockwise: u and v are not to be mirrored as seen from there.
+            uv = uv * (-1.0, 1.0)
         # Linear when refined: charts have jagged borders, which splines would fold over.
         return tessellate(replace(cage, uv=Values("unwrapped", uv, "faceVarying"), seams="all"), level)
 
