@@ -64,7 +64,7 @@ def values(prim: Usd.Prim) -> Iterator[Issue]:
         expected = attribute.since <= version <= SCHEMA_VERSION and attribute.type_name != "asset"
         if expected and value is not None and not usd_attribute.HasAuthoredValue():
             message = "not authored; programs that do not know usdfab's schema cannot see it"
-            yield warning(path, prim, "authored", message)
+            yield warning(path, prim, "authored", message, "write the fabric again with `usdfab edit`")
         problem = "the attribute is missing" if value is None else _value_problem(attribute, value)
         if problem:
             wrong = True
@@ -127,7 +127,8 @@ def preview(prim: Usd.Prim) -> Iterator[Issue]:
         return
     source, _, _ = UsdShade.Material(prim).ComputeSurfaceSource()
     if not source or source.GetIdAttr().Get() != "UsdPreviewSurface":
-        yield error(prim, prim, "preview", "no UsdPreviewSurface on outputs:surface; other viewers show nothing")
+        message = "no UsdPreviewSurface on outputs:surface, other viewers show nothing"
+        yield error(prim, prim, "preview", message, "write the fabric again with `usdfab edit`")
 
 
 def curves(prim: Usd.Prim) -> Iterator[Issue]:
@@ -138,7 +139,7 @@ def curves(prim: Usd.Prim) -> Iterator[Issue]:
     extent = boundable.GetExtentAttr()
     authored = extent.Get(Usd.TimeCode.EarliestTime()) if extent.HasAuthoredValue() else None
     if authored is None or len(authored) != 2 or not np.isfinite(np.asarray(authored)).all():
-        yield error(prim, prim, "extent", "no authored extent; viewers cull or drop the prim")
+        yield error(prim, prim, "extent", "no authored extent, viewers cull or drop the prim", "author it")
     elif np.abs(np.asarray(authored)).max() >= 1e37:
         yield error(extent, prim, "extent", "the extent is infinite; compute it before the prototypes become overs")
     if not prim.IsA(UsdGeom.BasisCurves):
@@ -159,7 +160,7 @@ def _widths(curves: UsdGeom.BasisCurves, counts: np.ndarray, points: int, time: 
     attribute = primvar.GetAttr() if primvar else curves.GetWidthsAttr()
     widths = attribute.Get(time)
     if widths is None:
-        yield error(prim, prim, "widths", "no widths; viewers draw lines")
+        yield error(prim, prim, "widths", "no widths, viewers draw lines", "author constant or vertex widths")
         return
     interpolation = primvar.GetInterpolation() if primvar else curves.GetWidthsInterpolation()
     expected = {tokens.constant: 1, tokens.uniform: len(counts), tokens.vertex: points}.get(interpolation)

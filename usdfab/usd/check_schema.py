@@ -35,8 +35,9 @@ def names(prim: Usd.Prim) -> Iterator[Issue]:
     if not authored:
         return
     if not is_fabric(prim):
-        if not yarn_instances(prim) and not prim.IsAbstract():
-            text = f"{len(authored)} attributes of usdfab ({authored[0]}, ...), but {FABRIC_API} is not applied"
+        known = [name for name in authored if name in _TYPES]
+        if known and not yarn_instances(prim) and not prim.IsAbstract():
+            text = f"{len(known)} attributes of a fabric ({known[0]}, ...), but {FABRIC_API} is not applied"
             yield error(prim, prim, "api", text, f"add {FABRIC_API} to the prim's apiSchemas")
         return
     version = prim.GetAttribute(fabric_attribute_name("schemaVersion")).Get()
