@@ -267,6 +267,23 @@ def test_instances_by_their_root_only(make, new_mesh, fabric_file, tmp_path):
     assert fabrics_of(tmp_path / "b.usda") == {"/World/Copy/Cloth": {"Denim"}}
 
 
+@pytest.mark.parametrize("prim", ["/World/Many/Prototypes/Cloth", "/World/Many/Prototypes", "/World/Many"])
+def test_prototypes_of_point_instancers(make, new_mesh, fabric_file, tmp_path, prim):
+    def build(stage):
+        instancer = UsdGeom.PointInstancer.Define(stage, "/World/Many")
+        new_mesh(stage, "/World/Many/Prototypes/Cloth", SQUARE, QUAD, UV)
+        stage.GetRootLayer().GetPrimAtPath("/World/Many/Prototypes").specifier = Sdf.SpecifierOver
+        instancer.CreatePrototypesRel().SetTargets(["/World/Many/Prototypes/Cloth"])
+        instancer.CreateProtoIndicesAttr([0] * 6)
+        instancer.CreatePositionsAttr([Gf.Vec3f(2 * i, 0, 0) for i in range(6)])
+
+    bound = bind(make(build), fabric_file, tmp_path / "b.usda", prims=[prim], rotate=90)
+    assert bound.meshes == ("/World/Many/Prototypes/Cloth",) and bound.warnings == ()
+    (mesh,) = read_scene(tmp_path / "b.usda").meshes
+    assert len(mesh.placements) == 6
+    assert fabrics_of(tmp_path / "b.usda") == {"/World/Many/Prototypes/Cloth": {"Denim"}}
+
+
 # --- what wins ---
 
 

@@ -82,7 +82,7 @@ def existing(stage: Usd.Stage, path: str) -> Usd.Prim:
         raise UsdfabError("the prim is deactivated", place=place, remedy="activate it first, or choose another")
     if prim.IsAbstract():
         raise UsdfabError("the prim is a class, which is not drawn", place=place, remedy="bind what inherits it")
-    if not prim.IsDefined():
+    if not prim.HasDefiningSpecifier() and not meshes_below(prim):
         raise UsdfabError("the prim is an over of nothing", place=place, remedy="is a reference or payload missing?")
     return prim
 
@@ -97,9 +97,9 @@ def instance_root(prim: Usd.Prim) -> Usd.Prim | None:
 
 
 def meshes_below(prim: Usd.Prim) -> tuple[Usd.Prim, ...]:
-    """The prim if it is a mesh, and meshes below it, instances' included."""
-    found = Usd.PrimRange(prim, Usd.TraverseInstanceProxies())
-    return tuple(p for p in found if p.IsA(UsdGeom.Mesh))
+    """The prim if it is a mesh, and meshes below it, those of instances and of prototypes below an over included."""
+    found = Usd.PrimRange(prim, Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded & ~Usd.PrimIsAbstract))
+    return tuple(p for p in found if p.IsA(UsdGeom.Mesh) and p.HasDefiningSpecifier())
 
 
 def _checked_subset(subset: UsdGeom.Subset) -> Usd.Prim:
