@@ -536,6 +536,16 @@ def test_a_stage_without_meshes_and_a_file_without_fabric(make, one, fabric_file
         bind(one, one, tmp_path / "b.usda")
 
 
+def test_what_usd_stumbles_over_is_an_error_of_the_users(one, fabric_file, tmp_path):
+    text = one.read_text().replace(
+        "int[] faceVertexCounts", "asset material:binding = @x@\n        int[] faceVertexCounts"
+    )
+    (tmp_path / "bad.usda").write_text(text)
+    with pytest.raises(UsdfabError, match=r"bad.usda: USD cannot read it .*is not a relationship"):
+        bind(tmp_path / "bad.usda", fabric_file, tmp_path / "b.usda")
+    assert not (tmp_path / "b.usda").exists()
+
+
 def test_nvidias_checker_agrees(one, fabric_file, tmp_path):
     nvidia = pytest.importorskip("usd_validation_nvidia")
     bind(one, fabric_file, tmp_path / "b.usda", rotate=10)

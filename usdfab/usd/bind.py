@@ -21,6 +21,7 @@ from usdfab.usd.atomic import atomic_path, checked_output
 from usdfab.usd.bind_targets import FAMILY, Target, collection_target, default_targets, listed, prim_target
 from usdfab.usd.fabric_io import fabric_from_prim, find_fabric
 from usdfab.usd.orientation import ROTATION, SCALE
+from usdfab.usd.problems import Problems
 from usdfab.usd.schema_source import fabric_attribute_name
 from usdfab.usd.stage import GENERATOR, open_stage, stage_name
 
@@ -95,24 +96,26 @@ def bind(
     _keep_inputs(out, base, cloth)
     origin = find_fabric(cloth, material)
     fabric_from_prim(origin)
-    targets = [prim_target(base, path) for path in dict.fromkeys(prims)]
-    targets += [collection_target(base, text) for text in dict.fromkeys(collections)]
-    targets = targets or default_targets(base, every=every)
-    with atomic_path(out, overwrite=overwrite) as temporary:
-        stage, warnings = _new_layer(base, temporary)
-        writer = _Writer(stage, relative_asset(fabric, temporary.parent), origin.GetPath())
-        writer.select(variants or {})
-        for target in targets:
-            writer.bind(target, stronger=stronger, rotate=rotate, scale=scale)
-        if meters_per_uv is not None:
-            attribute = writer.material.GetPrim().GetAttribute(fabric_attribute_name("metersPerUv"))
-            attribute.Set(float(meters_per_uv))
-        warnings += writer.warnings
-        warnings += [text for target in targets for text in _overruled(writer, target)]
-        path, meshes = str(writer.material.GetPath()), tuple(dict.fromkeys(writer.meshes))
-        stage.GetRootLayer().Save()
-        del stage, writer
-    return Bound(Path(out), path, tuple(t.path for t in targets), meshes, tuple(dict.fromkeys(warnings)))
+    # What USD itself stumbles over is an error of the user's, like the rest.
+    with Problems(strict=True).tolerating(str(source), ""):
+        targets = [prim_target(base, path) for path in dict.fromkeys(prims)]
+        targets += [collection_target(base, text) for text in dict.fromkeys(collections)]
+        targets = targets or default_targets(base, every=every)
+        with atomic_path(out, overwrite=overwrite) as temporary:
+            stage, warnings = _new_layer(base, temporary)
+            writer = _Writer(stage, relative_asset(fabric, temporary.parent), origin.GetPath())
+            writer.select(variants or {})
+            for target in targets:
+                writer.bind(target, stronger=stronger, rotate=rotate, scale=scale)
+            if meters_per_uv is not None:
+                attribute = writer.material.GetPrim().GetAttribute(fabric_attribute_name("metersPerUv"))
+                attribute.Set(float(meters_per_uv))
+            warnings += writer.warnings
+            warnings += [text for target in targets for text in _overruled(writer, target)]
+            path, meshes = str(writer.material.GetPath()), tuple(dict.fromkeys(writer.meshes))
+            stage.GetRootLayer().Save()
+            del stage, writer
+        return Bound(Path(out), path, tuple(t.path for t in targets), meshes, tuple(dict.fromkeys(warnings)))
 
 
 def _check_numbers(rotate: float | None, scale: float | None, meters_per_uv: float | None) -> None:
