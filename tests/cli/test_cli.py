@@ -56,7 +56,20 @@ def refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
 def test_help_lists_every_command_and_shows_examples() -> None:
     done = usdfab("--help")
     assert done.returncode == 0
-    for name in ("fit", "render", "merge", "inspect", "expand", "new", "edit", "info", "check", "evaluate", "schema"):
+    for name in (
+        "fit",
+        "render",
+        "merge",
+        "inspect",
+        "bind",
+        "expand",
+        "new",
+        "edit",
+        "info",
+        "check",
+        "evaluate",
+        "schema",
+    ):
         assert name in done.stdout
         page = usdfab(name, "--help")
         assert page.returncode == 0
@@ -100,8 +113,13 @@ def test_new_writes_what_info_reads(kind: str, tmp_path: Path) -> None:
 def test_every_preset_passes_the_check(name: str, tmp_path: Path) -> None:
     path = tmp_path / "a.usda"
     assert usdfab("new", name, "-o", path).returncode == 0
-    done = usdfab("check", path, "--strict")
-    assert done.returncode == 0, done.stdout
+    done = usdfab("check", path, "--strict", "--json")
+    # The yarns of dense satins are closer than they are wide.
+    rules = ["usdfab:cover"] if name in ("silk-satin", "cotton-sateen") else []
+    issues = json.loads(done.stdout)["issues"]
+    assert [issue["rule"] for issue in issues if issue["severity"] != "info"] == rules
+    assert done.returncode == (1 if rules else 0)
+    assert usdfab("check", path).returncode == 0
 
 
 def test_edit_changes_only_what_it_is_told(small: Path, tmp_path: Path) -> None:
@@ -119,8 +137,10 @@ def test_check_finds_an_error_and_says_so_by_its_exit_code(tmp_path: Path, small
         small.read_text().replace("double usdfab:yarn:warp:radius = 0.0002", "double usdfab:yarn:warp:radius = -1")
     )
     done = usdfab("check", path, "--json")
-    assert done.returncode == 1
-    assert any("radius" in issue["site"] for issue in json.loads(done.stdout)["issues"])
+    assert done.returncode == 2
+    result = json.loads(done.stdout)
+    assert result["counts"]["error"] == 1 and result["exit_code"] == 2 and result["schema"] == "usdfab/1"
+    assert any("radius" in issue["site"] for issue in result["issues"])
 
 
 def test_schema_folder_serves_any_usd_program(small: Path) -> None:

@@ -74,7 +74,7 @@ def test_round_trip_is_loss_free(tmp_path_factory, suffix, fabric, meters):
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_presets_are_clean_and_author_everything(name, tmp_path):
     path = write_fabric(preset(name), tmp_path / "f.usda")
-    assert check(path) == []
+    assert {i.rule for i in check(path)} <= {"usdfab:cover", "usdfab:unusual"}
     assert read_fabric(path) == preset(name)
     stage = Usd.Stage.Open(str(path))
     prim = stage.GetPrimAtPath(FABRIC_PATH)

@@ -8,6 +8,7 @@ from pxr import Gf, Usd, UsdGeom
 
 from usdfab.errors import UsdfabError
 from usdfab.usd.read_scene import read_scene
+from usdfab.usd.stretch import surfaces
 from usdfab.usd.unwrap import _unfolded, unwrap, unwrap_faces
 
 
@@ -143,3 +144,24 @@ def test_a_bent_face_is_unfolded():
     # its own corners stay
     for k in range(3):
         np.testing.assert_allclose(_unfolded(triangle, triangle[:, k]), np.eye(3)[[k]], atol=1e-12)
+
+
+@pytest.mark.parametrize("handed", ["rightHanded", "leftHanded"])
+@pytest.mark.parametrize("side", [1, -1])
+def test_nothing_is_mirrored_seen_from_the_front(fabric, handed, side):
+    # A closed box and a folded sheet make many charts.
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    points, quads = sheet(10, 0.3)
+    box = np.array([(x, y, z) for z in (2, 3) for y in (0, 1) for x in (0, 1)], dtype=float)
+    faces = np.array([(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)])
+    mesh = UsdGeom.Mesh.Define(stage, "/M")
+    mesh.CreatePointsAttr([Gf.Vec3f(*map(float, p)) for p in np.concatenate([points, box])])
+    mesh.CreateFaceVertexCountsAttr([4] * (len(quads) + 6))
+    mesh.CreateFaceVertexIndicesAttr(np.concatenate([quads, faces + len(points)]).ravel().tolist())
+    mesh.CreateSubdivisionSchemeAttr("none")
+    mesh.CreateOrientationAttr(handed)
+    mesh.AddScaleOp().Set(Gf.Vec3f(side, 1, 1))
+    scene = read_scene(stage, fabric_override=fabric)
+    (surface,) = surfaces(scene, 1.25)
+    assert surface.report.mirrored < 1e-6 and surface.report.degenerate == 0

@@ -1,6 +1,7 @@
 """The ``usdfab`` command: one module per sub-command, loaded when it runs.
 
-Exit codes: 0 done; 1 the check found errors; 2 bad input or usage; 130 interrupted.
+Exit codes: 0 done; 1 the check found warnings (--strict); 2 bad input or usage, or the check found errors; 130
+interrupted.
 Results go to stdout, talk goes to stderr.
 """
 
@@ -23,6 +24,7 @@ Usage examples:
 
     usdfab fit photo.png -o fabric.usda --size 3.6mm --report report
     usdfab render fabric.usda -o swatch.png
+    usdfab bind cloth.usda fabric.usda -o bound.usda
     usdfab render cloth.usda --fabric fabric.usda -o cloth.exr
     usdfab inspect fabric.usda
 """
@@ -32,6 +34,7 @@ COMMANDS = {
     "render": "Render a fabric as a swatch, or a stage whose meshes wear fabrics.",
     "merge": "Join the parts of a picture that render --tile wrote.",
     "inspect": "Look at the fibers of a fabric, in a window or as a picture.",
+    "bind": "Put a fabric on the cloth of a stage, and see how it stretches.",
     "expand": "Write the cloth of a stage as instanced fibers for any USD program.",
     "new": "Write a new fabric from a preset or a weave.",
     "edit": "Change parameters of a fabric.",

@@ -2,11 +2,32 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 from pxr import Ar, Sdf, Usd
 
 from usdfab.errors import UsdfabError
 
 UDIM = "<UDIM>"
+
+
+def relative_asset(file: str | Path, folder: str | Path) -> str:
+    """The path by which a layer in ``folder`` names ``file``: with forward slashes, anchored by ``./`` or ``../``.
+
+    Raises
+    ------
+    UsdfabError
+        If there is none: both are on different drives.
+    """
+    try:
+        found = Path(os.path.relpath(Path(file).resolve(), Path(folder).resolve())).as_posix()
+    except ValueError as error:
+        raise UsdfabError(
+            f"there is no relative path to it from {folder}", place=str(file), remedy="keep both on one drive"
+        ) from error
+    # A bare name would be looked up on search paths too.
+    return found if found.startswith(".") else f"./{found}"
 
 
 def image_file(attribute: Usd.Attribute, time: Usd.TimeCode) -> str:

@@ -3,261 +3,115 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-import numpy as np
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, UsdValidation
+from pxr import Sdf, Tf, Usd
 
 from usdfab.errors import UsdfabError
-from usdfab.fabric import PARAMETER_BY_NAME
-from usdfab.fabric.fabric import checked_value
-from usdfab.usd.fabric_io import fabric_from_prim, is_fabric, meters_per_uv_from_prim
-from usdfab.usd.primvars import UV_NAMES
-from usdfab.usd.registration import FABRIC_API, YARN_API
-from usdfab.usd.schema_source import (
-    FABRIC_ATTRIBUTES,
-    SCHEMA_VERSION,
-    YARN_ATTRIBUTES,
-    SchemaAttribute,
-    fabric_attribute_name,
-    yarn_attribute_name,
-)
+from usdfab.fabric.plausible import doubts, unusual
+from usdfab.usd.check_assets import bindings, missing_files
+from usdfab.usd.check_rules import applied, cloth, curves, preview, values
+from usdfab.usd.check_schema import names, primvars, tokens, types
+from usdfab.usd.check_usd import composition_issues, plain, quiet_usd, validator_issues
+from usdfab.usd.fabric_io import fabric_from_prim, is_fabric
+from usdfab.usd.issue import SEVERITIES, Issue, Severity, info, warning
+from usdfab.usd.schema_source import camel, yarn_attribute_name
 from usdfab.usd.stage import open_stage, site, stage_name
 
-Severity = Literal["error", "warning", "info"]
+__all__ = ["RULES", "Issue", "Severity", "check", "exit_code"]
+
+MAX_ISSUES = 10_000
+"""After so many findings a last one says that the rest of the stage is not checked."""
+# What USD's bindings raise for stages that are not as they should be.
+_UNREADABLE = (
+    Tf.ErrorException, TypeError, ValueError, ArithmeticError, LookupError, AttributeError, RuntimeError, OSError,
+    MemoryError, AssertionError,
+)  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Issue:
-    """One finding. ``site`` is ``file</prim.attribute>``; ``rule`` is stable, ``usdfab:...`` for our own."""
+def plausible(prim: Usd.Prim) -> Iterator[Issue]:
+    """``usdfab:cover``, ``interpenetration``, ``packing``, ``fiberRadius``, ``crimp``: cloth that cannot exist.
 
-    severity: Severity
-    site: str
-    rule: str
-    message: str
+    ``usdfab:unusual`` for values that few fabrics have.
+    """
+    if not is_fabric(prim) or prim.GetTypeName() != "Material":
+        return
+    try:
+        fabric = fabric_from_prim(prim)
+    except UsdfabError:
+        # Values that are out of range have issues of their own.
+        return
+    for doubt in doubts(fabric):
+        place = prim.GetPath().AppendProperty(yarn_attribute_name(doubt.system, camel(doubt.parameter)))
+        yield warning(place, prim, doubt.rule, doubt.message, doubt.remedy)
+    for doubt in unusual(fabric):
+        place = prim.GetPath().AppendProperty(yarn_attribute_name(doubt.system, camel(doubt.parameter)))
+        yield info(place, prim, doubt.rule, doubt.message)
 
-    def __str__(self) -> str:
-        return f"{self.severity}: {self.site}: {self.message} ({self.rule})"
+
+RULES: tuple[Callable[[Usd.Prim], Iterator[Issue]], ...] = (
+    applied, values, preview, curves, cloth, names, types, tokens, primvars, plausible, missing_files, bindings,
+)  # fmt: skip
+"""usdfab's own rules: a prim to its issues."""
 
 
 def check(source: str | Path | Usd.Stage) -> list[Issue]:
     """Everything that is wrong with a USD file, errors first; empty if nothing is.
 
     Runs all of UsdValidation's validators, without the false alarms about shaders that usd-core does not know
-    (MaterialX's ``ND_*``, in older versions even USD's own), and the rules in ``RULES``.
+    (MaterialX's ``ND_*``, in older versions even USD's own), and the rules in ``RULES``. Prims inside instances are
+    checked once for each prototype. What cannot even be read is an issue too (``usdfab:unreadable``).
 
     Raises
     ------
     UsdfabError
-        If the file is missing or USD cannot read it.
+        If the file is missing or USD cannot read it; nothing else.
     """
-    stage = open_stage(source)
-    issues = list(_usd_issues(stage))
-    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate)):
-        for rule in RULES:
-            issues += rule(prim)
-    order = ("error", "warning", "info")
-    return sorted(issues, key=lambda i: (order.index(i.severity), i.site, i.rule))
+    with quiet_usd():
+        stage = open_stage(source)
+        issues = _guarded(lambda: composition_issues(stage), stage_name(stage))
+        for prim in prims(stage):
+            place = site(stage, prim)
+            for rule in RULES:
+                issues += _guarded(lambda prim=prim, rule=rule: rule(prim), place)  # type: ignore[misc]
+            if len(issues) > MAX_ISSUES:
+                text = f"more than {MAX_ISSUES} findings, the rest of the stage is not checked"
+                issues.append(Issue("warning", stage_name(stage), "usdfab:many", text))
+                break
+        issues += _guarded(lambda: validator_issues(stage, issues), stage_name(stage))
+    return sorted(dict.fromkeys(issues), key=lambda i: (SEVERITIES.index(i.severity), i.site, i.rule))
 
 
-# --- USD's validators ------------------------------------------------------------------------------------------------
+def exit_code(issues: list[Issue], *, strict: bool = False) -> int:
+    """2 with an error, 1 with a warning if ``strict``, else 0."""
+    severities = {issue.severity for issue in issues}
+    if "error" in severities:
+        return 2
+    return int(strict and "warning" in severities)
 
 
-def _usd_issues(stage: Usd.Stage) -> Iterator[Issue]:
-    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    kinds = UsdValidation.ValidationErrorType
-    severities: dict[object, Severity] = {kinds.Error: "error", kinds.Warn: "warning", kinds.Info: "info"}
-    context = UsdValidation.ValidationContext(validators)
+def prims(stage: Usd.Stage) -> Iterator[Usd.Prim]:
+    """Every prim of a stage, overs and classes too; of several instances of one prototype the first one's."""
+    seen: set[Sdf.Path] = set()
+    walk = iter(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate)))
+    for prim in walk:
+        yield prim
+        if prim.IsInstance():
+            prototype = prim.GetPrototype().GetPath()
+            if prototype in seen:
+                walk.PruneChildren()
+            seen.add(prototype)
+
+
+def _guarded(rule: Callable[[], Iterator[Issue]], place: str) -> list[Issue]:
+    """The issues of a rule; what it stumbles over is one more."""
+    found: list[Issue] = []
     try:
-        errors = context.Validate(stage)
-    except Tf.ErrorException:
-        # usd-core 25.11 ships no definitions of USD's own shaders and says so, once, by an exception.
-        errors = context.Validate(stage)
-    for error in errors:
-        if error.HasNoError() or _false_alarm(error):
-            continue
-        severity = severities.get(error.GetType(), "info")
-        yield Issue(
-            severity, _first_site(stage, error), str(error.GetIdentifier()), " ".join(error.GetMessage().split())
-        )
-
-
-def _false_alarm(error: UsdValidation.ValidationError) -> bool:
-    known = ("'ND_", "'UsdPreviewSurface'", "'UsdUVTexture'", "'UsdPrimvarReader_", "'UsdTransform2d'")
-    return error.GetName() == "MissingShaderIdInRegistry" and any(name in error.GetMessage() for name in known)
-
-
-def _first_site(stage: Usd.Stage, error: UsdValidation.ValidationError) -> str:
-    for found in error.GetSites():
-        if found.IsProperty():
-            return site(stage, found.GetProperty())
-        if found.IsPrim() and not found.GetPrim().IsPseudoRoot():
-            return site(stage, found.GetPrim())
-    return stage_name(stage)
-
-
-# --- our rules -------------------------------------------------------------------------------------------------------
-
-
-def _error(where: Usd.Prim | Usd.Property | Sdf.Path, prim: Usd.Prim, rule: str, message: str) -> Issue:
-    return Issue("error", site(prim.GetStage(), where), f"usdfab:{rule}", message)
-
-
-def _warning(where: Usd.Prim | Usd.Property | Sdf.Path, prim: Usd.Prim, rule: str, message: str) -> Issue:
-    return Issue("warning", site(prim.GetStage(), where), f"usdfab:{rule}", message)
-
-
-def _yarn_instances(prim: Usd.Prim) -> list[str]:
-    prefix = f"{YARN_API}:"
-    return [name[len(prefix) :] for name in prim.GetAppliedSchemas() if name.startswith(prefix)]
-
-
-def _applied(prim: Usd.Prim) -> Iterator[Issue]:
-    """``usdfab:material``, ``usdfab:instance``, ``usdfab:systems``: what carries the schemas, and whole."""
-    instances, fabric = _yarn_instances(prim), is_fabric(prim)
-    if not instances and not fabric:
-        return
-    if prim.GetTypeName() != "Material" and not prim.IsAbstract():
-        kind = prim.GetTypeName() or "prim without type"
-        yield _error(prim, prim, "material", f"{FABRIC_API} and {YARN_API} belong on a Material, not on a {kind}")
-    unknown = sorted(set(instances) - {"warp", "weft"})
-    if unknown:
-        yield _error(prim, prim, "instance", f"unknown yarn system {', '.join(unknown)}; use warp and weft")
-    missing = [s for s in ("warp", "weft") if s not in instances]
-    if missing or not fabric:
-        names = [f"{YARN_API}:{s}" for s in missing] + ([] if fabric else [FABRIC_API])
-        yield _error(prim, prim, "systems", f"the fabric is not whole, apply {', '.join(names)}")
-
-
-def _values(prim: Usd.Prim) -> Iterator[Issue]:
-    """``usdfab:value``, ``usdfab:authored``, ``usdfab:weaveSize``, ``usdfab:fabric``: the parameters themselves."""
-    if not is_fabric(prim) or prim.GetTypeName() != "Material":
-        return
-    found = False
-    version = prim.GetAttribute(fabric_attribute_name("schemaVersion")).Get() or SCHEMA_VERSION
-    for name, attribute in _attributes(prim):
-        path = prim.GetPath().AppendProperty(name)
-        usd_attribute = prim.GetAttribute(name)
-        value = usd_attribute.Get() if usd_attribute else None
-        # Files of another version hold other attributes: the defaults of those that came later do no harm.
-        expected = attribute.since <= version <= SCHEMA_VERSION and attribute.type_name != "asset"
-        if expected and value is not None and not usd_attribute.HasAuthoredValue():
-            message = "not authored; programs that do not know usdfab's schema cannot see it"
-            yield _warning(path, prim, "authored", message)
-        problem = "the attribute is missing" if value is None else _value_problem(attribute, value)
-        if problem:
-            found = True
-            yield _error(path, prim, "value", problem)
-    size = prim.GetAttribute(fabric_attribute_name("weave:size"))
-    matrix = prim.GetAttribute(fabric_attribute_name("weave:matrix"))
-    if size and matrix and size.Get() is not None and matrix.Get() is not None:
-        picks, ends = size.Get()
-        if picks * ends != len(matrix.Get()):
-            found = True
-            message = f"the matrix has {len(matrix.Get())} values, the size {picks} x {ends} asks for {picks * ends}"
-            yield _error(matrix, prim, "weaveSize", message)
-    if not found and set(_yarn_instances(prim)) >= {"warp", "weft"}:
-        try:
-            fabric_from_prim(prim)
-            meters_per_uv_from_prim(prim)
-        except UsdfabError as error:
-            yield Issue("error", error.place or site(prim.GetStage(), prim), "usdfab:fabric", error.problem)
-
-
-def _attributes(prim: Usd.Prim) -> Iterator[tuple[str, SchemaAttribute]]:
-    for attribute in FABRIC_ATTRIBUTES:
-        yield fabric_attribute_name(attribute.name), attribute
-    for system in _yarn_instances(prim):
-        if system in ("warp", "weft"):
-            for attribute in YARN_ATTRIBUTES:
-                yield yarn_attribute_name(system, attribute.name), attribute
-
-
-def _value_problem(attribute: SchemaAttribute, value: object) -> str:
-    """What is wrong with a value, or an empty string."""
-    if attribute in YARN_ATTRIBUTES:
-        try:
-            checked_value(PARAMETER_BY_NAME[attribute.field], value)
-        except UsdfabError as error:
-            return error.problem
-        return ""
-    if attribute.hard is None:
-        return ""
-    try:
-        numbers = np.atleast_1d(np.asarray(value, dtype=float))
-    except (TypeError, ValueError):
-        return f"expected a value of type {attribute.type_name}"
-    low, high = attribute.hard
-    bad = numbers[~(np.isfinite(numbers) & (numbers >= low) & (numbers <= high))]
-    return f"{bad[0]:g} is not between {low:g} and {high:g}" if len(bad) else ""
-
-
-def _preview(prim: Usd.Prim) -> Iterator[Issue]:
-    """``usdfab:preview``: viewers that know no fibers need a UsdPreviewSurface."""
-    if not is_fabric(prim) or prim.GetTypeName() != "Material":
-        return
-    source, _, _ = UsdShade.Material(prim).ComputeSurfaceSource()
-    if not source or source.GetIdAttr().Get() != "UsdPreviewSurface":
-        yield _error(prim, prim, "preview", "no UsdPreviewSurface on outputs:surface; other viewers show nothing")
-
-
-def _curves(prim: Usd.Prim) -> Iterator[Issue]:
-    """``usdfab:extent``, ``usdfab:curveCounts``, ``usdfab:widths``: curves and instancers that viewers can draw."""
-    if not (prim.IsA(UsdGeom.Curves) or prim.IsA(UsdGeom.PointInstancer)):
-        return
-    boundable = UsdGeom.Boundable(prim)
-    extent = boundable.GetExtentAttr()
-    authored = extent.Get(Usd.TimeCode.EarliestTime()) if extent.HasAuthoredValue() else None
-    if authored is None or len(authored) != 2 or not np.isfinite(np.asarray(authored)).all():
-        yield _error(prim, prim, "extent", "no authored extent; viewers cull or drop the prim")
-    elif np.abs(np.asarray(authored)).max() >= 1e37:
-        yield _error(extent, prim, "extent", "the extent is infinite; compute it before the prototypes become overs")
-    if not prim.IsA(UsdGeom.BasisCurves):
-        return
-    curves, time = UsdGeom.BasisCurves(prim), Usd.TimeCode.EarliestTime()
-    counts = np.asarray(curves.GetCurveVertexCountsAttr().Get(time) or [], dtype=np.int64)
-    points = curves.GetPointsAttr().Get(time)
-    number = 0 if points is None else len(points)
-    if counts.sum() != number:
-        message = f"the curves ask for {int(counts.sum())} points, there are {number}"
-        yield _error(curves.GetCurveVertexCountsAttr(), prim, "curveCounts", message)
-    yield from _widths(curves, counts, number, time)
-
-
-def _widths(curves: UsdGeom.BasisCurves, counts: np.ndarray, points: int, time: Usd.TimeCode) -> Iterator[Issue]:
-    tokens, prim = UsdGeom.Tokens, curves.GetPrim()
-    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("widths")
-    attribute = primvar.GetAttr() if primvar else curves.GetWidthsAttr()
-    widths = attribute.Get(time)
-    if widths is None:
-        yield _error(prim, prim, "widths", "no widths; viewers draw lines")
-        return
-    interpolation = primvar.GetInterpolation() if primvar else curves.GetWidthsInterpolation()
-    expected = {tokens.constant: 1, tokens.uniform: len(counts), tokens.vertex: points}.get(interpolation)
-    if expected is None:
-        message = f"{interpolation} widths are drawn differently by every program; use constant or vertex"
-        yield _warning(attribute, prim, "widths", message)
-    elif len(widths) != expected:
-        message = f"{len(widths)} {interpolation} widths, expected {expected}"
-        yield _error(attribute, prim, "widths", message)
-
-
-def _cloth(prim: Usd.Prim) -> Iterator[Issue]:
-    """``usdfab:uv``: a mesh that carries a fabric should say by texture coordinates where its yarns run."""
-    if not prim.IsA(UsdGeom.Mesh):
-        return
-    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
-    if material and is_fabric(material.GetPrim()):
-        api = UsdGeom.PrimvarsAPI(prim)
-        textured = any(
-            p.GetTypeName().role == Sdf.ValueRoleNames.TextureCoordinate for p in api.GetPrimvarsWithValues()
-        )
-        if not textured and not any(api.HasPrimvar(name) for name in UV_NAMES):
-            message = "the cloth has no texture coordinates, renderers unwrap it as they like; add 'st'"
-            yield _warning(prim, prim, "uv", message)
-
-
-RULES: tuple[Callable[[Usd.Prim], Iterator[Issue]], ...] = (_applied, _values, _preview, _curves, _cloth)
-"""usdfab's own rules: a prim to its issues."""
+        for issue in rule():
+            found.append(issue)
+    except UsdfabError as error:
+        found.append(Issue("error", error.place or place, "usdfab:unreadable", error.problem, error.remedy))
+    except _UNREADABLE as error:
+        reason = plain(str(error)) or type(error).__name__
+        found.append(Issue("error", place, "usdfab:unreadable", f"a value here is not what it should be ({reason})"))
+    return found

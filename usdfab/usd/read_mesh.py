@@ -21,10 +21,13 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Bindings:
-    """Material prims bound to a mesh and its subsets, None where nothing is, and (F,) which of them the faces have."""
+    """Material prims bound to a mesh and its subsets, None where nothing is, and (F,) which of them the faces have.
+
+    ``prims``: the mesh and the subsets that they are bound to."""
 
     materials: list[Usd.Prim | None]
     slot: Ints
+    prims: list[Usd.Prim]
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +233,7 @@ def read_bindings(prim: Usd.Prim, time: Usd.TimeCode, problems: Problems) -> Bin
     counts = UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(time)
     faces = 0 if counts is None else len(counts)
     materials: list[Usd.Prim | None] = [_bound(prim)]
-    slot = np.zeros(faces, dtype=np.int64)
+    slot, prims = np.zeros(faces, dtype=np.int64), [prim]
     for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
         if subset.GetElementTypeAttr().Get() != UsdGeom.Tokens.face:
             continue
@@ -241,7 +244,8 @@ def read_bindings(prim: Usd.Prim, time: Usd.TimeCode, problems: Problems) -> Bin
                 raise UsdfabError(f"a face index is out of range, the mesh has {faces} faces", place=place)
             slot[indices] = len(materials)
             materials.append(_bound(subset.GetPrim()))
-    return Bindings(materials, slot)
+            prims.append(subset.GetPrim())
+    return Bindings(materials, slot, prims)
 
 
 def _bound(prim: Usd.Prim) -> Usd.Prim | None:

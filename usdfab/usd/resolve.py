@@ -17,6 +17,7 @@ from usdfab.usd.bake import Baked, bake, bake_many
 from usdfab.usd.collect import Placed, canonical
 from usdfab.usd.fabric_io import fabric_from_prim, is_fabric, meters_per_uv_from_prim
 from usdfab.usd.frames import Shutter
+from usdfab.usd.orientation import ROTATION, SCALE, Orientation, read_orientation
 from usdfab.usd.primvars import ALBEDO, Values
 from usdfab.usd.problems import Problems
 from usdfab.usd.read_materials import Look, plain_material, read_material, unbound_material
@@ -29,7 +30,7 @@ from usdfab.usd.unwrap import unwrap_faces
 
 SHARED = 4
 """From so many copies on, a mesh is stored once."""
-_INHERITED = (ALBEDO, "displayColor", "displayOpacity")
+_INHERITED = (ALBEDO, ROTATION, SCALE, "displayColor", "displayOpacity")
 
 
 @dataclass(eq=False)
@@ -95,7 +96,7 @@ class Resolver:
         return list(shapes.values())
 
     def _inherited(self, prim: Usd.Prim) -> tuple[bytes, ...]:
-        """The colours that a prim inherits from its ancestors, which may differ between copies."""
+        """Colours and orientation that a prim inherits from its ancestors, which may differ between copies."""
         api, found = UsdGeom.PrimvarsAPI(prim), []
         for name in _INHERITED:
             primvar = api.FindPrimvarWithInheritance(name)
@@ -165,7 +166,9 @@ class Resolver:
             if not baked.areas().sum() > 0:
                 raise UsdfabError("the mesh has no area", place=site(self.stage, shape.prim))
             assert shape.cage is not None
-            materials = self._face_materials(shape, baked, shape.bindings.slot[local.face], override, force)
+            slots = shape.bindings.slot[local.face]
+            baked = self._turned(shape, baked, slots, override, force)
+            materials = self._face_materials(shape, baked, slots, override, force)
             meshes.append(
                 Mesh(
                     str(group.prim.GetPath()), baked.points, baked.triangles, baked.normals, baked.uv, materials,
@@ -195,8 +198,31 @@ class Resolver:
         # As large as the first copy, but not turned as it is: the charts of a mesh that moves stay what they are.
         stretch = _stretch(first.to_world[0])
         uv = unwrap_faces(cage.rest @ stretch, cage.topology.counts, cage.topology.indices)
+        if cage.left_handed != (np.linalg.det(first.to_world[0, :3, :3]) < 0):
+            # The front is where the faces run clockwise: u and v are not to be mirrored as seen from there.
+            uv = uv * (-1.0, 1.0)
         # Linear when refined: charts have jagged borders, which splines would fold over.
         return tessellate(replace(cage, uv=Values("unwrapped", uv, "faceVarying"), seams="all"), level)
+
+    def _orientation(self, prim: Usd.Prim) -> Orientation:
+        """How the fabric lies on a mesh or a subset; as it is where that cannot be read (a fault)."""
+        with self.problems.tolerating(str(prim.GetPath()), "the fabric is not turned or scaled"):
+            return read_orientation(prim, self.shutter.frame)
+        return Orientation()
+
+    def _turned(
+        self, shape: _Shape, baked: Baked, slots: np.ndarray, override: FabricParameters | None, force: bool
+    ) -> Baked:
+        """The texture coordinates of the faces that are cloth, turned as their prims say."""
+        if baked.uv is None:
+            return baked
+        uv = baked.uv
+        for slot, (material, prim) in enumerate(zip(shape.bindings.materials, shape.bindings.prims, strict=True)):
+            faces = slots == slot
+            if faces.any() and (force or self._is_cloth(material, override)):
+                uv = uv.copy()
+                uv[faces] = self._orientation(prim).turned(uv[faces])
+        return replace(baked, uv=uv)
 
     def _is_cloth(self, prim: Usd.Prim | None, override: FabricParameters | None) -> bool:
         return prim is not None and is_fabric(prim) and (override is not None or self._fabric(prim) is not None)
@@ -235,7 +261,8 @@ class Resolver:
             if fabric is None and prim is not None and is_fabric(prim):
                 fabric = self._fabric(prim)
             if fabric is not None and (force or self._is_cloth(prim, override)):
-                index[slot] = self._add_fabric(shape, baked, faces, prim, fabric)
+                orientation = self._orientation(shape.bindings.prims[slot])
+                index[slot] = self._add_fabric(shape, baked, faces, prim, fabric, orientation)
             elif prim:
                 self._check_coordinates(shape, prim)
                 index[slot] = self._shared(prim)
@@ -283,7 +310,13 @@ class Resolver:
         return self._parameters[path]
 
     def _add_fabric(
-        self, shape: _Shape, baked: Baked, faces: np.ndarray, prim: Usd.Prim | None, fabric: FabricParameters
+        self,
+        shape: _Shape,
+        baked: Baked,
+        faces: np.ndarray,
+        prim: Usd.Prim | None,
+        fabric: FabricParameters,
+        orientation: Orientation,
     ) -> int:
         """A FabricSurface and its material for the triangles ``faces`` of one mesh."""
         meters = 0.0
@@ -291,9 +324,10 @@ class Resolver:
             with self.problems.tolerating(str(prim.GetPath()), "metres per uv are measured"):
                 meters = meters_per_uv_from_prim(prim)
         path = str(prim.GetPath()) if prim else shape.path
-        surface = FabricSurface(
-            path, fabric, meters or self._measured(shape, baked, faces), albedo_map(fabric, path, self.problems)
-        )
+        # A fabric that lies larger has less of its cloth in one unit of uv.
+        meters = (meters or self._measured(shape, baked, faces)) / orientation.scale
+        texture = orientation.in_place(albedo_map(fabric, path, self.problems))
+        surface = FabricSurface(path, fabric, meters, texture)
         self.fabrics.append(surface)
         if prim is not None and UsdShade.Material(prim):
             look = self._look(prim).material

@@ -67,7 +67,7 @@ class Mesh:
     normals: (T, 3, 3) or None
         Unit shading normals at the corners, where the stage authors them or the mesh is a subdivision surface.
     uv: (T, 3, 2) or None
-        Texture coordinates at the corners.
+        Texture coordinates at the corners; turned where a fabric is turned on it (``usdfab.usd.orientation``).
     face_material: (T,) int32
         Index into ``Scene.materials``.
     placements: (K, 3, 4) or None
@@ -154,7 +154,7 @@ class FabricSurface:
     fabric: FabricParameters
     meters_per_uv: float
     albedo_map: Texture | None = None
-    """Multiplies the fiber albedo; looked up with the mesh's uv."""
+    """Multiplies the fiber albedo; looked up with the mesh's uv, its transform undoing the fabric's rotation."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -26,18 +28,32 @@ def open_stage(source: str | Path | Usd.Stage) -> Usd.Stage:
     if isinstance(source, Usd.Stage):
         return source
     path = Path(source)
-    if not path.exists():
+    try:
+        found = path.exists()
+    except (OSError, ValueError) as error:
+        raise UsdfabError(
+            f"this is no file name ({getattr(error, 'strerror', None) or error})", place=str(path)
+        ) from error
+    if not found:
         raise UsdfabError("the file does not exist", place=str(path))
     if path.is_dir():
         raise UsdfabError("this is a folder, not a USD file", place=str(path))
     if not Sdf.FileFormat.FindByExtension(path.suffix):
         raise UsdfabError("this is not a USD file", place=str(path), remedy="USD files are .usda, .usdc, .usd, .usdz")
+    if not os.access(path, os.R_OK):
+        raise UsdfabError("the file is not readable", place=str(path), remedy="change its permissions")
     try:
         return Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        lines = str(error).strip().splitlines()
-        reason = lines[-1].strip() if lines else "unreadable"
-        raise UsdfabError(f"USD cannot read the file ({reason})", place=str(path)) from error
+        raise UsdfabError(f"USD cannot read the file ({_reason(error)})", place=str(path)) from error
+
+
+def _reason(error: Tf.ErrorException) -> str:
+    """What went wrong first, without the place in USD's sources: ``'message'`` at the end of each line."""
+    text = str(error)
+    messages = [m.strip() for m in re.findall(r" : '(.*?)'\s*(?=\n\s*Error in|\Z)", text, flags=re.DOTALL)]
+    said = [m for m in messages if not m.startswith("Failed to open layer")] or messages or [text]
+    return " ".join(said[0].split()) or "unreadable"
 
 
 def stage_name(stage: Usd.Stage) -> str:

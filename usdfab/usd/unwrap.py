@@ -20,7 +20,8 @@ time grows with the square of a chart's triangles."""
 def unwrap(points: Array, triangles: Ints) -> Array:
     """(T, 3, 2) texture coordinates in metres for a triangle mesh: charts without much distortion, packed side by side.
 
-    They are scaled so that all triangles together have as much area in uv as on the surface. The same input gives the
+    No chart is mirrored: seen from where the triangles run counter-clockwise, so do u and v. The coordinates are
+    scaled so that all triangles together have as much area in uv as on the surface. The same input gives the
     same coordinates.
 
     Parameters
@@ -55,14 +56,34 @@ def unwrap(points: Array, triangles: Ints) -> Array:
     options.create_image = False
     atlas.generate(charts, options)
     _, indices, normalized = atlas[0]
-    flat = np.asarray(normalized, dtype=np.float64) * [atlas.width, atlas.height]
+    indices = np.asarray(indices, dtype=np.int64)
+    flat = _upright(np.asarray(normalized, dtype=np.float64) * [atlas.width, atlas.height], indices)
     uv = np.zeros((len(triangles), 3, 2))
-    uv[proper] = flat[np.asarray(indices, dtype=np.int64)]
+    uv[proper] = flat[indices]
     edges = uv[:, 1:] - uv[:, :1]
     covered = 0.5 * np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]).sum()
     if not covered > 0:
         raise UsdfabError("xatlas finds no charts for the mesh")
     return uv * np.sqrt(area.sum() / covered)
+
+
+def _upright(flat: Array, triangles: Ints) -> Array:
+    """(V, 2) coordinates whose charts, which share no vertices, are not mirrored: xatlas makes them either way."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.concatenate([triangles[:, :2], triangles[:, 1:]])
+    links = coo_matrix((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(len(flat),) * 2)
+    number, chart = connected_components(links, directed=False)
+    a, b = (flat[triangles[:, k]] - flat[triangles[:, 0]] for k in (1, 2))
+    area = np.bincount(chart[triangles[:, 0]], a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], minlength=number)
+    low, high = np.full(number, np.inf), np.full(number, -np.inf)
+    np.minimum.at(low, chart, flat[:, 0])
+    np.maximum.at(high, chart, flat[:, 0])
+    # About the chart's own middle, so that it stays where it was packed.
+    mirrored = (area < 0)[chart]
+    u = np.where(mirrored, low[chart] + high[chart] - flat[:, 0], flat[:, 0])
+    return np.stack([u, flat[:, 1]], axis=1)
 
 
 def unwrap_faces(points: Array, counts: Ints, indices: Ints) -> Array:
