@@ -1,5 +1,6 @@
 """What a woven fabric is: parameters, weaves, presets, sampling. Plain data over NumPy."""
 
+from usdfab.fabric.draft import Draft as Draft, DraftYarns as DraftYarns, with_draft as with_draft
 from usdfab.fabric.fabric import (
     SYSTEMS as SYSTEMS,
     Color as Color,
@@ -26,3 +27,5 @@ from usdfab.fabric.weave import (
     Weave as Weave,
     weave_from_name as weave_from_name,
 )
+from usdfab.fabric.wif import read_wif as read_wif
+from usdfab.fabric.wif_write import write_wif as write_wif
