@@ -13,6 +13,7 @@ from usdfab.fabric.fabric import (
     parse_length as parse_length,
     parse_size as parse_size,
 )
+from usdfab.fabric.mix import mixed as mixed
 from usdfab.fabric.parameters import (
     PARAMETER_BY_NAME as PARAMETER_BY_NAME,
     YARN_PARAMETERS as YARN_PARAMETERS,
@@ -20,6 +21,7 @@ from usdfab.fabric.parameters import (
 )
 from usdfab.fabric.plies import ply_circles as ply_circles, ply_fill as ply_fill
 from usdfab.fabric.presets import PRESETS as PRESETS, preset as preset
+from usdfab.fabric.recolor import hex_color as hex_color, parse_color as parse_color, recolored as recolored
 from usdfab.fabric.sampling import sample_fabric as sample_fabric
 from usdfab.fabric.weave import (
     NAMED_WEAVES as NAMED_WEAVES,

@@ -137,7 +137,7 @@ def with_draft(fabric: FabricParameters, draft: Draft) -> FabricParameters:
     becomes the fewest whole repeats that are at least as large as before.
     """
     cells = _cells(fabric, draft)
-    yarns = {}
+    yarns: dict[System, YarnParameters] = {}
     for system, spacing, before in zip(SYSTEMS, cells, fabric.cell, strict=True):
         yarn, told = fabric.system(system), draft.yarns(system)
         radius = yarn.radius * spacing / before
@@ -145,7 +145,7 @@ def with_draft(fabric: FabricParameters, draft: Draft) -> FabricParameters:
             radius = 0.5 * told.thickness / yarn.flattening
         yarn = replace(yarn, radius=radius)
         yarns[system] = dyed(yarn, told.colors) if told.colors else yarn
-    woven = replace(fabric, weave=draft.weave, name=draft.name, **yarns)
+    woven = replace(fabric.with_systems(yarns), weave=draft.weave, name=draft.name)
     picks, ends = woven.repeat()
     side = max(ends * cells[0], picks * cells[1], *fabric.size)
     # Rounded before it is rounded up: 3.0000000001 repeats are 3.
@@ -170,8 +170,8 @@ def dyed(yarn: YarnParameters, colors: Sequence[Color]) -> YarnParameters:
     if len(set(colors)) == 1:
         return replace(yarn, albedo=colors[0], yarn_albedo=())
     shortest = next(n for n in range(1, len(colors) + 1) if len(colors) % n == 0 and _repeats(colors, n))
-    mean = tuple(float(c) for c in np.mean(colors, axis=0))
-    return replace(yarn, albedo=mean, yarn_albedo=tuple(colors[:shortest]))
+    red, green, blue = (float(c) for c in np.mean(colors, axis=0))
+    return replace(yarn, albedo=(red, green, blue), yarn_albedo=tuple(colors[:shortest]))
 
 
 def _repeats(colors: Sequence[Color], length: int) -> bool:

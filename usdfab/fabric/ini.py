@@ -1,8 +1,9 @@
 """Reading the INI dialect of weaving files: tolerant of how real programs write it, bounded in what it takes.
 
-The rules are those of the WIF 1.1 specification (Ravi Nielsen, 1997): ``[SECTION]`` lines, ``key=value`` lines, comments
-after ``;``, names in any case and any order, and private sections that no one else reads. Python's ``configparser`` is
-not used since it refuses duplicate keys, lines without ``=`` and stray text, all of which real files hold.
+The rules are those of the WIF 1.1 specification (Ravi Nielsen, 1997): ``[SECTION]`` lines, ``key=value`` lines,
+comments after ``;``, names in any case and any order, and private sections that no one else reads. Python's
+``configparser`` is not used since it refuses duplicate keys, lines without ``=`` and stray text, all of which real
+files hold.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Reading weavers' drafts in the Weaving Information File format, WIF 1.1 (Ravi Nielsen and others, 1997).
 
-What real programs write is taken as it is meant: colour ranges other than 0-255, threads without lines, lift plans beside
-treadlings, several shafts or treadles in a line, missing table entries, private sections. What is ignored is told in
-``Draft.warnings``. Colours are sRGB in the file and linear Rec. 709 here. ``wif_write`` writes such files.
+What real programs write is taken as it is meant: colour ranges other than 0-255, threads without lines, lift plans
+beside treadlings, several shafts or treadles in a line, missing table entries, private sections. What is ignored is
+told in ``Draft.warnings``. Colours are sRGB in the file and linear Rec. 709 here. ``wif_write`` writes such files.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
-from usdfab.fabric.draft import Bools, Draft, compose, draft_of_drawdown, drawdown
+from usdfab.fabric.draft import Bools, Draft, DraftYarns, compose, draft_of_drawdown, drawdown
 from usdfab.fabric.fabric import Color
 from usdfab.fabric.ini import IniFile, read_ini
 from usdfab.srgb import srgb_to_linear
@@ -79,7 +79,9 @@ class _Reader:
         """The draft (see ``read_wif``)."""
         if not {"THREADING", "TREADLING", "LIFTPLAN", "WEAVING"} & set(self.ini.sections):
             raise UsdfabError(
-                "no draft in this file", place=self.place, remedy="a WIF needs [THREADING] and [TREADLING] or [LIFTPLAN]"
+                "no draft in this file",
+                place=self.place,
+                remedy="a WIF needs [THREADING] and [TREADLING] or [LIFTPLAN]",
             )
         if not self.ini.section("THREADING"):
             raise UsdfabError("the draft has no threading", place=f"{self.place} [THREADING]")
@@ -94,8 +96,8 @@ class _Reader:
         matrix = drawdown(threading, lift, self._rising())
         draft, (picks, ends) = draft_of_drawdown(matrix, warp.colors, weft.colors, self._title(), self.place)
         self._tell_repeat(matrix.shape, (picks, ends))
-        warp_yarns = replace(draft.warp, **self._lengths("warp", warp, ends))
-        weft_yarns = replace(draft.weft, **self._lengths("weft", weft, picks))
+        warp_yarns = DraftYarns(draft.warp.colors, *self._lengths("warp", warp, ends))
+        weft_yarns = DraftYarns(draft.weft.colors, *self._lengths("weft", weft, picks))
         self._tell_ignored()
         return replace(draft, warp=warp_yarns, weft=weft_yarns, warnings=tuple(self.warnings))
 
@@ -151,7 +153,7 @@ class _Reader:
 
     def _used(self, matrix: Bools, axis: int, threads: _Threads, label: str, why: str) -> tuple[Bools, _Threads]:
         """Without the ends or picks that have no entry in ``matrix``."""
-        keep = matrix.any(axis=1 - axis)
+        keep: Bools = np.asarray(matrix.any(axis=1 - axis))
         if not keep.any():
             raise UsdfabError(f"all {label}s {why}", place=self.place)
         if not keep.all():
@@ -181,7 +183,7 @@ class _Reader:
             return np.zeros(number)
         return values * METERS[unit]
 
-    def _lengths(self, system: str, threads: _Threads, repeat: int) -> dict[str, float]:
+    def _lengths(self, system: str, threads: _Threads, repeat: int) -> tuple[float, float]:
         """Mean spacing and thickness over one repeat, where they can be believed."""
         lengths = {}
         for name, values in (("spacing", threads.spacing[:repeat]), ("thickness", threads.thickness[:repeat])):
@@ -195,9 +197,11 @@ class _Reader:
                 self.warnings.append(f"the {system}'s {name} varies ({spread}); its mean is used for all yarns")
             lengths[name] = mean
         if lengths["thickness"] > MAX_COVER * lengths["spacing"] > 0:
-            self.warnings.append(f"the {system} is {MAX_COVER:g} times as thick as its spacing; its thickness was ignored")
+            self.warnings.append(
+                f"the {system} is {MAX_COVER:g} times as thick as its spacing; its thickness was ignored"
+            )
             lengths["thickness"] = 0.0
-        return lengths
+        return lengths["spacing"], lengths["thickness"]
 
     def _colors(self, system: str, number: int) -> tuple[Color, ...]:
         """The colour of each thread, or nothing where the file names none."""
