@@ -63,8 +63,7 @@ def run(
     if screenshot is not None:
         write_image(screenshot, picture, overwrite=overwrite)
     picks, ends = fabric.repeat()
-    weave = fabric.weave.tiled(picks // fabric.weave.picks, ends // fabric.weave.ends)
-    loom = loom_of(weave)
+    loom = loom_of(fabric.weave.matrix)
     colors = {s: len(set(fabric.system(s).colors())) for s in ("warp", "weft")}
     if json:
         print_json(

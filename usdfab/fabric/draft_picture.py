@@ -22,7 +22,7 @@ def crossing_colors(fabric: FabricParameters, copies: tuple[int, int] = (1, 1)) 
     """(picks, ends, 3) linear colour of the yarn on top at each crossing of so many repeats (x, y); row 0 is pick 1."""
     picks, ends = fabric.repeat()
     picks, ends = picks * copies[1], ends * copies[0]
-    matrix = fabric.weave.tiled(picks // fabric.weave.picks, ends // fabric.weave.ends).matrix
+    matrix = np.tile(fabric.weave.matrix, (picks // fabric.weave.picks, ends // fabric.weave.ends))
     weft, warp = (np.asarray(fabric.system(s).colors()) for s in ("weft", "warp"))
     rows, columns = weft[np.arange(picks) % len(weft)], warp[np.arange(ends) % len(warp)]
     return np.where(matrix[..., None] == 1, rows[:, None], columns[None, :])
@@ -49,7 +49,7 @@ def draft_picture(fabric: FabricParameters, cell: int = 12, fewest: int = 16) ->
     picks, ends = fabric.repeat()
     copies = -(-fewest // ends), -(-fewest // picks)
     colors = crossing_colors(fabric, copies)
-    loom = loom_of(fabric.weave.tiled(picks // fabric.weave.picks, ends // fabric.weave.ends))
+    loom = loom_of(np.tile(fabric.weave.matrix, (picks // fabric.weave.picks, ends // fabric.weave.ends)))
     tops = _plans(fabric, loom, colors.shape[0], colors.shape[1])
     if max(tops.shape[:2]) * cell > MAX_PIXELS:
         raise UsdfabError(

@@ -88,6 +88,9 @@ class _Reader:
         shafts, treadles = self._count("WEAVING", "shafts"), self._count("WEAVING", "treadles")
         threading = self._lists("THREADING", "end", self._count("WARP", "threads"), shafts, "shaft").T
         lift = self._lift(self._count("WEFT", "threads"), shafts, treadles)
+        for section, matrix in (("THREADING", threading), ("TREADLING] or [LIFTPLAN", lift)):
+            if matrix.size == 0:
+                raise UsdfabError("no thread has an entry", place=f"{self.place} [{section}]")
         shafts = max(len(threading), lift.shape[1])
         threading, lift = _padded(threading, (shafts, threading.shape[1])), _padded(lift, (len(lift), shafts))
         warp, weft = self._threads("WARP", threading.shape[1]), self._threads("WEFT", len(lift))

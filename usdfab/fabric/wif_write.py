@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from usdfab._version import __version__
 from usdfab.errors import UsdfabError
-from usdfab.fabric.draft import loom_of
+from usdfab.fabric.draft import loom_of, period
 from usdfab.fabric.fabric import Color, FabricParameters, YarnParameters
 from usdfab.fabric.weave import MAX_REPEAT
 from usdfab.fabric.wif import MAX_THREADS, WIF_SUFFIXES
@@ -21,7 +22,7 @@ MAX_TREADLES = 40
 
 
 def write_wif(path: str | Path, fabric: FabricParameters, *, overwrite: bool = False) -> Path:
-    """Write one repeat of ``fabric`` as a draft and return the path.
+    """Write a repeat of ``fabric`` as a draft and return the path.
 
     Weave, colours (sRGB, 8 bits a channel), spacing and thickness go into the file; of a fabric it holds nothing else.
     Each end is on one shaft, equal ends share it. Up to ``MAX_TREADLES`` treadles there is a tie-up with a treadling,
@@ -53,9 +54,12 @@ def wif_text(fabric: FabricParameters) -> str:
             f"weave and colours repeat after {picks} picks and {ends} ends, above {MAX_THREADS}",
             remedy="choose colour sequences that fit the weave",
         )
-    weave = fabric.weave.tiled(picks // fabric.weave.picks, ends // fabric.weave.ends)
-    loom = loom_of(weave)
     warp, weft = (_codes(fabric.system(s).colors()) for s in ("warp", "weft"))
+    matrix = np.tile(fabric.weave.matrix, (picks // fabric.weave.picks, ends // fabric.weave.ends))
+    copies = _copies(matrix, weft), _copies(matrix.T, warp)
+    picks, ends = picks * copies[0], ends * copies[1]
+    # Its own checks would refuse what is above MAX_REPEAT.
+    loom = loom_of(np.tile(matrix, copies))
     table = sorted(set(warp) | set(weft), key=[*warp, *weft].index)
     numbers = {code: k + 1 for k, code in enumerate(table)}
     treadled = loom.treadles <= MAX_TREADLES
@@ -84,6 +88,12 @@ def wif_text(fabric: FabricParameters) -> str:
     head += ["Source Program=usdfab", f"Source Version={__version__}"]
     blocks = {"WIF": head, "CONTENTS": [f"{name}=true" for name in sections], **sections}
     return "\n".join(line for name, lines in blocks.items() for line in (f"[{name}]", *lines, ""))
+
+
+def _copies(lines: NDArray[np.uint8], codes: Sequence[tuple[int, ...]]) -> int:
+    """How often to write a repeat: twice if its end looks like a shorter repeat that was cut off (plain, 5 picks)."""
+    tokens = [(line.tobytes(), codes[k % len(codes)]) for k, line in enumerate(np.ascontiguousarray(lines))]
+    return 2 if len(tokens) % period(tokens) else 1
 
 
 def _system(yarn: YarnParameters, threads: int, spacing: float, color: int) -> list[str]:

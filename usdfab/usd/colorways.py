@@ -33,12 +33,12 @@ COLOR_ATTRIBUTES = frozenset(
 
 
 def colorways(prim: Usd.Prim) -> tuple[tuple[str, ...], str]:
-    """Names of a fabric's colourways, in order, and the selected one (empty for none)."""
+    """Names of a fabric's colourways, ``original`` first, and the selected one (empty for none)."""
     found = prim.GetVariantSets()
     if not found.HasVariantSet(COLORWAY):
         return (), ""
     own = found.GetVariantSet(COLORWAY)
-    return tuple(own.GetVariantNames()), str(own.GetVariantSelection())
+    return tuple(sorted(own.GetVariantNames(), key=lambda n: (n != ORIGINAL, n))), str(own.GetVariantSelection())
 
 
 def check_name(name: str) -> None:
@@ -77,7 +77,7 @@ def add_colorway_set(layer: Sdf.Layer, prim: Usd.Prim) -> None:
         attribute = prim.GetStage().GetAttributeAtPath(place)
         target = place.ReplacePrefix(path, variant_path(path, ORIGINAL))
         if layer.GetAttributeAtPath(place):
-            Sdf.CreatePrimInLayer(layer, target.GetPrimPath())
+            _owner(layer, target.GetParentPath())
             Sdf.CopySpec(layer, place, layer, target)
             owner = layer.GetPrimAtPath(place.GetPrimPath())
             owner.RemoveProperty(owner.properties[place.name])
@@ -92,12 +92,26 @@ def select(layer: Sdf.Layer, path: Sdf.Path, name: str) -> None:
 
 def set_value(layer: Sdf.Layer, path: Sdf.Path, type_name: Sdf.ValueTypeName, value: object, *, uniform: bool) -> None:
     """Author one attribute's default in a layer, in a variant too; prims above it become overs where they are not."""
-    owner = Sdf.CreatePrimInLayer(layer, path.GetPrimPath())
+    owner = _owner(layer, path.GetParentPath())
     spec = layer.GetAttributeAtPath(path)
     if not spec:
         variability = Sdf.VariabilityUniform if uniform else Sdf.VariabilityVarying
         spec = Sdf.AttributeSpec(owner, path.name, type_name, variability)
     spec.default = value
+
+
+def _owner(layer: Sdf.Layer, path: Sdf.Path) -> Sdf.PrimSpec:
+    """The prim spec at ``path``, made where there is none, in a variant too (``Sdf.CreatePrimInLayer`` makes none)."""
+    if path.IsPrimVariantSelectionPath():
+        spec = _owner(layer, path.GetParentPath())
+        set_name, name = path.GetVariantSelection()
+        own = spec.variantSets.get(set_name) or Sdf.VariantSetSpec(spec, set_name)
+        variant = own.variants.get(name) or Sdf.VariantSpec(own, name)
+        return variant.primSpec
+    if not path.ContainsPrimVariantSelection():
+        return Sdf.CreatePrimInLayer(layer, path)
+    found = layer.GetPrimAtPath(path)
+    return found or Sdf.PrimSpec(_owner(layer, path.GetParentPath()), path.name, Sdf.SpecifierOver)
 
 
 def set_color(layer: Sdf.Layer, path: Sdf.Path, color: tuple[float, float, float]) -> None:

@@ -35,6 +35,7 @@ from usdfab.usd.fabric_io import (
     fabric_values,
     find_fabric,
     meters_per_uv_from_prim,
+    preview_color,
     preview_values,
     relative_path,
     write_fabric,
@@ -116,6 +117,8 @@ def change_fabric(
         colorway or selected,
         new=bool(colorway) and colorway not in names,
     )
+    if after.weave != before.weave:
+        _preview_others(layer, stage, prim, after, set(names) - {colorway or selected})
     with atomic_path(out, overwrite=overwrite) as temporary:
         if not layer.Export(str(temporary)):
             raise OSError("USD could not export the layer")
@@ -192,13 +195,34 @@ def _author(
                 set_value(layer, place, type_name, value, uniform=False)
 
 
+def _preview_others(
+    layer: Sdf.Layer, stage: Usd.Stage, prim: Usd.Prim, after: FabricParameters, names: set[str]
+) -> None:
+    """Author the preview's colour of the other colourways, which follows from the weave too."""
+    preview = preview_path(prim)
+    if preview is None:
+        return
+    place = preview.AppendProperty(DIFFUSE)
+    for name in sorted(names):
+        with Usd.EditContext(stage, stage.GetSessionLayer()):
+            prim.GetVariantSets().GetVariantSet(COLORWAY).SetVariantSelection(name)
+        dyed = fabric_from_prim(prim)
+        own = {
+            s: replace(after.system(s), albedo=dyed.system(s).albedo, yarn_albedo=dyed.system(s).yarn_albedo)
+            for s in SYSTEMS
+        }
+        target = place.ReplacePrefix(prim.GetPath(), variant_path(prim.GetPath(), name))
+        set_color(layer, target, preview_color(after.with_systems(own)))
+
+
 def _colors(fabric: FabricParameters) -> list[Any]:
     return [(fabric.system(s).albedo, fabric.system(s).yarn_albedo) for s in SYSTEMS]
 
 
 def _check_effect(file: Path, prim: Usd.Prim, expected: FabricParameters, name: str) -> None:
     """``UsdfabError`` if the fabric that is read from ``file`` is not the expected one."""
-    written = fabric_from_prim(find_fabric(Usd.Stage.Open(str(file)), prim.GetPath()))
+    stage = Usd.Stage.Open(str(file))  # kept in a name: prims do not keep their stage alive
+    written = fabric_from_prim(find_fabric(stage, prim.GetPath()))
     if replace(written, albedo_map="") != replace(expected, albedo_map=""):
         layers = {spec.layer.realPath for spec in prim.GetPrimStack()} - {prim.GetStage().GetRootLayer().realPath}
         where = f" ({', '.join(sorted(Path(p).name for p in layers if p))})" if layers else ""
