@@ -88,8 +88,8 @@ class _Reader:
         shafts, treadles = self._count("WEAVING", "shafts"), self._count("WEAVING", "treadles")
         threading = self._lists("THREADING", "end", self._count("WARP", "threads"), shafts, "shaft").T
         lift = self._lift(self._count("WEFT", "threads"), shafts, treadles)
-        for section, matrix in (("THREADING", threading), ("TREADLING] or [LIFTPLAN", lift)):
-            if matrix.size == 0:
+        for section, entries in (("THREADING", threading), ("TREADLING] or [LIFTPLAN", lift)):
+            if entries.size == 0:
                 raise UsdfabError("no thread has an entry", place=f"{self.place} [{section}]")
         shafts = max(len(threading), lift.shape[1])
         threading, lift = _padded(threading, (shafts, threading.shape[1])), _padded(lift, (len(lift), shafts))

@@ -42,7 +42,7 @@ def _segments(fabric: FabricParameters, system: str) -> int:
 
 
 def check_points(fabric: FabricParameters, vertices_per_segment: int, copies: tuple[int, int], variants: int) -> None:
-    """Raise ``UsdfabError`` if that many variants of the patch have more than ``MAX_PATCH_POINTS`` points."""
+    """Raise ``UsdfabError`` if so many variants of the patch have more than ``MAX_PATCH_POINTS`` points."""
     points = variants * patch_points(fabric, vertices_per_segment, copies)
     if points > MAX_PATCH_POINTS:
         picks, ends = fabric.repeat()
@@ -51,6 +51,12 @@ def check_points(fabric: FabricParameters, vertices_per_segment: int, copies: tu
             f"above {MAX_PATCH_POINTS:.2g}",
             remedy="set fewer variants or a lower both.fiber_count, or choose colour sequences that fit the weave",
         )
+
+
+def affordable_variants(fabric: FabricParameters, vertices_per_segment: int, copies: tuple[int, int]) -> int:
+    """The fabric's number of variants, or as many as fit: a large repeat hardly needs any, the eye finds none in it."""
+    points = patch_points(fabric, vertices_per_segment, copies)
+    return max(1, min(fabric.variants, MAX_PATCH_POINTS // max(1, points)))
 
 
 def thinned(fabric: FabricParameters) -> tuple[FabricParameters, tuple[str, ...]]:
@@ -68,8 +74,7 @@ def thinned(fabric: FabricParameters) -> tuple[FabricParameters, tuple[str, ...]
         return fabric, ()
     picks, ends = fabric.repeat()
     why = f"the repeat of {picks} picks and {ends} ends is large"
-    # A large repeat hardly needs variants: the eye finds no repetition in it.
-    variants = max(1, min(fabric.variants, MAX_PATCH_POINTS // max(1, points)))
+    variants = affordable_variants(fabric, PATH_TRACING_VERTICES, (1, 1))
     fabric = replace(fabric, variants=variants)
     if points * variants <= MAX_PATCH_POINTS:
         return fabric, (f"{why}: variants are set to {variants}",)

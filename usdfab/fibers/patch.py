@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, System, YarnParameters
-from usdfab.fibers.budget import PATH_TRACING_VERTICES as PATH_TRACING_VERTICES, check_points
+from usdfab.fibers.budget import PATH_TRACING_VERTICES as PATH_TRACING_VERTICES, affordable_variants, check_points
 from usdfab.fibers.draws import Draws, draw, variation
 from usdfab.fibers.fibers import YarnShape, fiber_offsets, successors
 from usdfab.fibers.flyaways import OpenCurves, flyaway_counts, flyaway_offsets
@@ -171,9 +171,11 @@ def patch_variants(
 ) -> list[Patch]:
     """Variants 0, 1, ... of a fabric's patch (``generate_patch``), all with one ``z_range``.
 
-    ``count`` is the fabric's own number of variants unless given. Errors as ``generate_patch``.
+    ``count`` is the fabric's own number of variants unless given, or as many as fit into memory. Errors as
+    ``generate_patch``.
     """
-    count = fabric.variants if count is None else count
+    if count is None:
+        count = affordable_variants(fabric, vertices_per_segment, copies)
     systems = _yarn_systems(fabric, vertices_per_segment, copies, count)
     patches = [_patch(systems, variant) for variant in range(count)]
     low, high = min(p.z_range[0] for p in patches), max(p.z_range[1] for p in patches)
