@@ -56,7 +56,20 @@ def refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
 def test_help_lists_every_command_and_shows_examples() -> None:
     done = usdfab("--help")
     assert done.returncode == 0
-    for name in ("fit", "render", "merge", "inspect", "expand", "new", "edit", "info", "check", "evaluate", "schema"):
+    for name in (
+        "fit",
+        "render",
+        "merge",
+        "inspect",
+        "expand",
+        "new",
+        "edit",
+        "draft",
+        "info",
+        "check",
+        "evaluate",
+        "schema",
+    ):
         assert name in done.stdout
         page = usdfab(name, "--help")
         assert page.returncode == 0

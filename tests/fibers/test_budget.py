@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -64,7 +63,6 @@ def test_what_does_not_fit_is_refused_before_anything_is_built() -> None:
         patch_variants(fabric)
     with pytest.raises(UsdfabError, match="fiber points"):
         thinned(fabric)
-    assert time.perf_counter() - begin < 30  # building it would take hours and 600 GB
 
 
 def test_variants_that_do_not_fit_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -242,7 +242,8 @@ def test_a_referenced_fabric_gets_colourways_too(tmp_path: Path, fabric: FabricP
 
 
 def test_the_colours_are_only_in_the_variants(colored: Path) -> None:
-    spec = Sdf.Layer.FindOrOpen(str(colored)).GetPrimAtPath(FABRIC_PATH)
+    layer = Sdf.Layer.FindOrOpen(str(colored))
+    spec = layer.GetPrimAtPath(FABRIC_PATH)
     assert not COLOR_ATTRIBUTES & {p.name for p in spec.properties}
     for variant in spec.variantSets[COLORWAY].variants.values():
         assert {p.name for p in variant.primSpec.properties} == COLOR_ATTRIBUTES
@@ -260,7 +261,7 @@ def test_colourways_that_are_refused(colored: Path, tmp_path: Path, fabric: Fabr
     stage = Usd.Stage.Open(str(colored))
     stage.GetPrimAtPath(FABRIC_PATH).GetVariantSet(COLORWAY).ClearVariantSelection()
     stage.Save()
-    with pytest.raises(UsdfabError, match="attribute is missing|no colourway is selected"):
+    with pytest.raises(UsdfabError, match="no colourway is selected"):
         edit_fabric(colored, {"warp.albedo": ".5,.5,.5"}, out)
     assert not out.exists()
 
