@@ -79,9 +79,8 @@ def test_warnings_of_a_draft_are_told_and_kept(run: Run, tmp_path: Path) -> None
 
 def test_large_drafts_are_thinned_and_say_so(run: Run, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
-    lift = "\n".join(
-        f"{i}={','.join(str(j + 1) for j in np.flatnonzero(rng.integers(0, 2, 300)))}" for i in range(1, 301)
-    )
+    lifts = (np.flatnonzero(rng.integers(0, 2, 300)) + 1 for _ in range(300))
+    lift = "\n".join(f"{k}={','.join(map(str, shafts))}" for k, shafts in enumerate(lifts, start=1))
     text = "[WEAVING]\nRising Shed=1\n[THREADING]\n" + "\n".join(f"{k}={k}" for k in range(1, 301))
     (tmp_path / "large.wif").write_text(f"{text}\n[LIFTPLAN]\n{lift}\n")
     code, _, error = run("new", "--wif", tmp_path / "large.wif", "-o", tmp_path / "a.usda")
