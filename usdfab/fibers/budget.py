@@ -14,8 +14,11 @@ import numpy as np
 from usdfab.errors import UsdfabError
 from usdfab.fabric import SYSTEMS, FabricParameters, System, YarnParameters
 
-MAX_PATCH_POINTS = 40_000_000
-"""Most points on the fibers of all variants of a patch. Building and tracing takes about 150 bytes for each: 6 GB."""
+MAX_PATCH_POINTS = 30_000_000
+"""Most points on the fibers of all variants of a patch. Building takes about 170 bytes for each, 5 GB, and minutes."""
+
+EASY_PATCH_POINTS = 12_000_000
+"""What drafts are thinned to: 2 GB, half a minute on two cores."""
 
 FEWEST_FIBERS = 6
 """Yarns are not thinned below this many fibers."""
@@ -53,14 +56,16 @@ def check_points(fabric: FabricParameters, vertices_per_segment: int, copies: tu
         )
 
 
-def affordable_variants(fabric: FabricParameters, vertices_per_segment: int, copies: tuple[int, int]) -> int:
+def affordable_variants(
+    fabric: FabricParameters, vertices_per_segment: int, copies: tuple[int, int], most: int | None = None
+) -> int:
     """The fabric's number of variants, or as many as fit: a large repeat hardly needs any, the eye finds none in it."""
     points = patch_points(fabric, vertices_per_segment, copies)
-    return max(1, min(fabric.variants, MAX_PATCH_POINTS // max(1, points)))
+    return max(1, min(fabric.variants, (most or MAX_PATCH_POINTS) // max(1, points)))
 
 
 def thinned(fabric: FabricParameters) -> tuple[FabricParameters, tuple[str, ...]]:
-    """``fabric`` within ``MAX_PATCH_POINTS``, and what was changed: first fewer variants, then fewer, thicker fibers.
+    """``fabric`` within ``EASY_PATCH_POINTS``, and what was changed: first fewer variants, then fewer, thicker fibers.
 
     The filled part of each yarn's cross-section stays.
 
@@ -70,15 +75,15 @@ def thinned(fabric: FabricParameters) -> tuple[FabricParameters, tuple[str, ...]
         If even ``FEWEST_FIBERS`` in each yarn are too many.
     """
     points = patch_points(fabric)
-    if points * fabric.variants <= MAX_PATCH_POINTS:
+    if points * fabric.variants <= EASY_PATCH_POINTS:
         return fabric, ()
     picks, ends = fabric.repeat()
     why = f"the repeat of {picks} picks and {ends} ends is large"
-    variants = affordable_variants(fabric, PATH_TRACING_VERTICES, (1, 1))
+    variants = affordable_variants(fabric, PATH_TRACING_VERTICES, (1, 1), EASY_PATCH_POINTS)
     fabric = replace(fabric, variants=variants)
-    if points * variants <= MAX_PATCH_POINTS:
+    if points * variants <= EASY_PATCH_POINTS:
         return fabric, (f"{why}: variants are set to {variants}",)
-    share = MAX_PATCH_POINTS / points
+    share = EASY_PATCH_POINTS / points
     yarns: dict[System, YarnParameters] = {}
     for system in SYSTEMS:
         yarn = fabric.system(system)
@@ -88,4 +93,4 @@ def thinned(fabric: FabricParameters) -> tuple[FabricParameters, tuple[str, ...]
     fabric = fabric.with_systems(yarns)
     check_points(fabric, PATH_TRACING_VERTICES, (1, 1), variants)
     counts = f"{yarns['warp'].fiber_count} fibers in each end and {yarns['weft'].fiber_count} in each pick"
-    return fabric, (f"{why}: variants are set to 1, with {counts}",)
+    return fabric, (f"{why}: variants are set to 1, with {counts}; set both.fiber_count for close-ups",)
