@@ -373,7 +373,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     for name, problem in (("none.wif", "does not exist"), (".", "folder")):
         with pytest.raises(UsdfabError, match=problem):
             read_wif(tmp_path / name)
-    with pytest.raises(UsdfabError, match="larger than 16 MB"):
+    with pytest.raises(UsdfabError, match="larger than 8 MB"):
         read(tmp_path, b"[WIF]\n" + b"; " * 8_500_000)
     assert decode(b"a\xff") == "aÿ"
 

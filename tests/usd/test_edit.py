@@ -241,6 +241,19 @@ def test_a_referenced_fabric_gets_colourways_too(tmp_path: Path, fabric: FabricP
     assert read_fabric(tmp_path / "o.usda") == fabric
 
 
+def test_colourways_of_a_referenced_fabric_are_overridden(
+    colored: Path, tmp_path: Path, fabric: FabricParameters
+) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "cloth.usda"))
+    stage.DefinePrim("/Looks/Cloth").GetReferences().AddReference("./red.usda", FABRIC_PATH)
+    stage.Save()
+    out = tmp_path / "out.usda"
+    changed = edit_fabric(tmp_path / "cloth.usda", {"weft.albedo": "1,1,1"}, out)
+    assert read_fabric(out) == changed and changed.weft.albedo == (1.0, 1.0, 1.0)
+    change_fabric(out, None, tmp_path / "o.usda", colorway="original")
+    assert read_fabric(tmp_path / "o.usda") == fabric
+
+
 def test_the_colours_are_only_in_the_variants(colored: Path) -> None:
     layer = Sdf.Layer.FindOrOpen(str(colored))
     spec = layer.GetPrimAtPath(FABRIC_PATH)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from usdfab.errors import UsdfabError
 
-MAX_BYTES = 16 * 1024 * 1024
+MAX_BYTES = 8 * 1024 * 1024
 """Largest file that is read; drafts are some ten kilobytes."""
 
 

@@ -66,9 +66,6 @@ def preview_path(prim: Usd.Prim) -> Sdf.Path | None:
 def add_colorway_set(layer: Sdf.Layer, prim: Usd.Prim) -> None:
     """Make the variant set in ``layer`` and move the colours of ``prim`` into its variant ``original``."""
     path = prim.GetPath()
-    spec = Sdf.CreatePrimInLayer(layer, path)
-    if COLORWAY not in spec.variantSetNameList.GetAddedOrExplicitItems():
-        spec.variantSetNameList.Prepend(COLORWAY)
     places = [path.AppendProperty(name) for name in sorted(COLOR_ATTRIBUTES)]
     preview = preview_path(prim)
     if preview is not None:
@@ -105,6 +102,9 @@ def _owner(layer: Sdf.Layer, path: Sdf.Path) -> Sdf.PrimSpec:
     if path.IsPrimVariantSelectionPath():
         spec = _owner(layer, path.GetParentPath())
         set_name, name = path.GetVariantSelection()
+        # A layer's variants count only if the same layer names their set.
+        if set_name not in spec.variantSetNameList.GetAddedOrExplicitItems():
+            spec.variantSetNameList.Prepend(set_name)
         own = spec.variantSets.get(set_name) or Sdf.VariantSetSpec(spec, set_name)
         variant = own.variants.get(name) or Sdf.VariantSpec(own, name)
         return variant.primSpec
