@@ -18,15 +18,20 @@ def run(
     /,
     *,
     output: Output,
-    set_: Annotated[list[str] | None, Parameter(name="--set", help="NAME=VALUE; may be given several times.")] = None,
+    set_: Annotated[
+        list[str] | None, Parameter(name="--set", negative="", help="NAME=VALUE; may be given several times.")
+    ] = None,
     weave: Annotated[str | None, Parameter(help="Another weave: a name or a matrix, as in usdfab new.")] = None,
     wif: Annotated[Path | None, Parameter(help="Weave, colours, spacing and thickness of a weavers' draft.")] = None,
     recolor: Annotated[
         list[str] | None,
-        Parameter(help="warp=#204080, weft=.1,.2,.5, both=..., '#aa3322->#224488'; may be given several times."),
+        Parameter(
+            negative="", help="warp=#204080, weft=.1,.2,.5, both=..., '#aa3322->#224488'; may be given several times."
+        ),
     ] = None,
     mix: Annotated[
-        tuple[Path, Path, float] | None, Parameter(help="Two fabrics and a number: 0 is the first, 1 the second.")
+        tuple[Path, Path, float] | None,
+        Parameter(negative="", help="Two fabrics and a number: 0 is the first, 1 the second."),
     ] = None,
     colorway: Annotated[
         str | None, Parameter(help="Put the new colours into this colourway of the file, and select it.")
@@ -45,7 +50,7 @@ def run(
     albedo, yarn_albedo, roughness_longitudinal, roughness_azimuthal, roughness_primary, ior, cuticle_tilt.
 
     Colours for --recolor are #rrggbb (sRGB) or three linear numbers. WARP=COLOR dyes all yarns of a system, stripes
-    included; OLD->NEW dyes the yarns that have a colour, warp:OLD->NEW only among the warp.
+    included; OLD->NEW dyes the yarns that have a colour, warp:OLD->NEW only among the warp. Quote # and > in a shell.
 
     --mix mixes lengths and numbers by their logarithms, all else linearly, colours as light; weave, plies, seed and
     name are the nearer fabric's.
@@ -58,7 +63,7 @@ def run(
         usdfab edit fabric.usda --set warp.albedo=.1,.2,.5 -o blue.usda
         usdfab edit fabric.usda --weave "twill 2/2" --set both.radius=120um -o twill.usda
         usdfab edit fabric.usda --wif samples/shepherd-check.wif -o check.usda
-        usdfab edit fabric.usda --colorway navy --recolor warp=#102040 -o colorways.usda
+        usdfab edit fabric.usda --colorway navy --recolor "warp=#102040" -o colorways.usda
         usdfab edit --mix linen.usda denim.usda 0.3 -o between.usda
 
     Parameters
@@ -70,7 +75,7 @@ def run(
     from usdfab.errors import UsdfabError
     from usdfab.fabric import as_table, edited, mixed, recolored
     from usdfab.usd.edit import change_fabric
-    from usdfab.usd.fabric_io import read_fabric, write_fabric
+    from usdfab.usd.fabric_io import read_fabric, read_meters_per_uv, write_fabric
 
     if (fabric is None) == (mix is None):
         raise UsdfabError("one fabric or --mix is needed" if fabric is None else "--mix names both of its fabrics")
@@ -93,7 +98,8 @@ def run(
     if mix is not None:
         first, second, amount = mix
         result = change(mixed(read_fabric(first), read_fabric(second), amount))
-        write_fabric(result, output, overwrite=overwrite)
+        meters = read_meters_per_uv(first if amount <= 0.5 else second)
+        write_fabric(result, output, meters_per_uv=meters, overwrite=overwrite)
     else:
         changes = bool(set_ or weave or wif or recolor)
         change_fabric(str(fabric), change if changes else None, output, colorway=colorway or "", overwrite=overwrite)

@@ -20,7 +20,9 @@ def run(
     *,
     output: Output,
     wif: Annotated[Path | None, Parameter(help="A weavers' draft (.wif): weave, colours, spacing, thickness.")] = None,
-    set_: Annotated[list[str] | None, Parameter(name="--set", help="NAME=VALUE, as in usdfab edit.")] = None,
+    set_: Annotated[
+        list[str] | None, Parameter(name="--set", negative="", help="NAME=VALUE, as in usdfab edit.")
+    ] = None,
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
