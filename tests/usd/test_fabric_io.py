@@ -23,10 +23,10 @@ from usdfab.fabric import (
 )
 from usdfab.usd.atomic import atomic_path
 from usdfab.usd.check import check
+from usdfab.usd.edit import edit_fabric
 from usdfab.usd.fabric_io import (
     FABRIC_PATH,
     define_fabric_material,
-    edit_fabric,
     preview_color,
     read_fabric,
     read_meters_per_uv,

@@ -10,7 +10,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import preset
-from usdfab.usd.fabric_io import edit_fabric, read_fabric, write_fabric
+from usdfab.usd.edit import edit_fabric
+from usdfab.usd.fabric_io import read_fabric, write_fabric
 from usdfab.usd.read_scene import read_scene
 
 SQUARE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]

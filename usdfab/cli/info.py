@@ -23,6 +23,7 @@ def run(file: Path, /, *, json: Json = False) -> None:
     """
     from usdfab.errors import UsdfabError
     from usdfab.fabric import as_table
+    from usdfab.usd.colorways import colorways
     from usdfab.usd.fabric_io import fabric_from_prim, fabric_prims
     from usdfab.usd.stage import open_stage
 
@@ -31,19 +32,24 @@ def run(file: Path, /, *, json: Json = False) -> None:
     if not prims:
         raise UsdfabError("no fabric in this file", place=str(file), remedy="make one with usdfab fit or usdfab new")
     fabrics = {str(prim.GetPath()): fabric_from_prim(prim) for prim in prims}
+    ways = {str(prim.GetPath()): colorways(prim) for prim in prims}
     if json:
-        tables = {path: as_table(fabric) for path, fabric in fabrics.items()}
+        tables = {
+            path: as_table(fabric) | {"colorways": list(ways[path][0]), "colorway": ways[path][1]}
+            for path, fabric in fabrics.items()
+        }
         # One fabric is the usual case: its table stands at the top; several are listed by path.
         print_json(next(iter(tables.values())) if len(tables) == 1 else {"fabrics": tables})
         return
     for path, fabric in fabrics.items():
-        print("\n".join(_lines(path, fabric)))
+        print("\n".join(_lines(path, fabric, *ways[path])))
 
 
-def _lines(path: str, fabric: Any) -> list[str]:
+def _lines(path: str, fabric: Any, colorways: tuple[str, ...], selected: str) -> list[str]:
     from usdfab.fabric import YARN_PARAMETERS
 
     weave = fabric.weave
+    ways = ", ".join(f"{name} (selected)" if name == selected else name for name in colorways)
     lines = [
         f"{path}: {fabric.name}",
         f"  weave        {weave.name} ({weave.classify()}), repeat {weave.picks} picks x {weave.ends} ends",
@@ -53,6 +59,7 @@ def _lines(path: str, fabric: Any) -> list[str]:
         f"  cover        warp {fabric.cover('warp'):.3g}, weft {fabric.cover('weft'):.3g}",
         f"  seed         {fabric.seed}",
         f"  variants     {fabric.variants}",
+        *([f"  colourways   {ways}"] if ways else []),
         f"  {'':24}{'warp':>24}  {'weft':>24}",
     ]
     for p in YARN_PARAMETERS:

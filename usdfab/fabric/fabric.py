@@ -148,6 +148,10 @@ class FabricParameters:
         """The yarn system called ``warp`` or ``weft``."""
         return self.warp if name == "warp" else self.weft
 
+    def with_systems(self, yarns: Mapping[System, YarnParameters]) -> FabricParameters:
+        """The same fabric with other yarn systems, one or both."""
+        return replace(self, warp=yarns.get("warp", self.warp), weft=yarns.get("weft", self.weft))
+
     def repeat(self) -> tuple[int, int]:
         """Picks and ends after which weave *and* colours repeat."""
         return (

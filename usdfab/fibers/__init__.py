@@ -1,5 +1,10 @@
 """Fiber geometry from fabric parameters: centre line, cross-section, noise, yarns, periodic patch."""
 
+from usdfab.fibers.budget import (
+    MAX_PATCH_POINTS as MAX_PATCH_POINTS,
+    patch_points as patch_points,
+    thinned as thinned,
+)
 from usdfab.fibers.draws import Draws as Draws, Variation as Variation, draw as draw, variation as variation
 from usdfab.fibers.fibers import (
     YarnShape as YarnShape,

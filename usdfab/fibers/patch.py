@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, System, YarnParameters
+from usdfab.fibers.budget import PATH_TRACING_VERTICES as PATH_TRACING_VERTICES, affordable_variants, check_points
 from usdfab.fibers.draws import Draws, draw, variation
 from usdfab.fibers.fibers import YarnShape, fiber_offsets, successors
 from usdfab.fibers.flyaways import OpenCurves, flyaway_counts, flyaway_offsets
 from usdfab.fibers.segments import Layout, lay_out
-
-PATH_TRACING_VERTICES = 40
-"""Vertices per segment for path tracing (Li et al. 2024, section 6.1)."""
 
 RASTERIZATION_VERTICES = 10
 """Vertices per segment for rasterization (Li et al. 2024, section 7.2)."""
@@ -156,6 +154,11 @@ def generate_patch(
         0, or another number for a patch that can stand in for that of variant 0 anywhere: on and near the border it
         is the same, inside it differs. Fibers and flyaways that may cross the border are the same in all variants, so
         a patch of few cells varies little, and one of two by two cells hardly at all.
+
+    Raises
+    ------
+    UsdfabError
+        If the repeat is too large for memory (``budget.MAX_PATCH_POINTS``).
     """
     return _patch(_yarn_systems(fabric, vertices_per_segment, copies), variant)
 
@@ -168,10 +171,13 @@ def patch_variants(
 ) -> list[Patch]:
     """Variants 0, 1, ... of a fabric's patch (``generate_patch``), all with one ``z_range``.
 
-    ``count`` is the fabric's own number of variants unless given.
+    ``count`` is the fabric's own number of variants unless given, or as many as fit into memory. Errors as
+    ``generate_patch``.
     """
-    systems = _yarn_systems(fabric, vertices_per_segment, copies)
-    patches = [_patch(systems, variant) for variant in range(fabric.variants if count is None else count)]
+    if count is None:
+        count = affordable_variants(fabric, vertices_per_segment, copies)
+    systems = _yarn_systems(fabric, vertices_per_segment, copies, count)
+    patches = [_patch(systems, variant) for variant in range(count)]
     low, high = min(p.z_range[0] for p in patches), max(p.z_range[1] for p in patches)
     return [replace(p, z_bounds=(low, high)) for p in patches]
 
@@ -259,10 +265,11 @@ class _YarnSystem:
 
 
 def _yarn_systems(
-    fabric: FabricParameters, vertices_per_segment: int, copies: tuple[int, int]
+    fabric: FabricParameters, vertices_per_segment: int, copies: tuple[int, int], variants: int = 1
 ) -> tuple[_YarnSystem, _YarnSystem]:
     if vertices_per_segment < 4:
         raise UsdfabError(f"{vertices_per_segment} vertices per segment are too few, at least 4 are needed")
+    check_points(fabric, vertices_per_segment, copies, variants)
     picks, ends = fabric.repeat()
     picks, ends = picks * copies[1], ends * copies[0]
     weave = fabric.weave.tiled(picks // fabric.weave.picks, ends // fabric.weave.ends)

@@ -18,7 +18,7 @@ import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
 from usdfab.errors import UsdfabError
-from usdfab.fabric import SYSTEMS, FabricParameters, Provenance, Weave, YarnParameters, edited
+from usdfab.fabric import SYSTEMS, FabricParameters, Provenance, Weave, YarnParameters
 from usdfab.usd.atomic import checked_output, export_layer
 from usdfab.usd.registration import FABRIC_API, YARN_API, require_schema
 from usdfab.usd.schema_source import (
@@ -55,14 +55,14 @@ def write_fabric(
         If the file exists (unless ``overwrite``), cannot be written, or a text in the fabric cannot be stored.
     """
     checked_output(path, overwrite=overwrite)
-    fabric = replace(fabric, albedo_map=_relative(fabric.albedo_map, Path(path).parent))
+    fabric = replace(fabric, albedo_map=relative_path(fabric.albedo_map, Path(path).parent))
     stage = new_stage()
     stage.SetDefaultPrim(UsdGeom.Scope.Define(stage, LOOKS_PATH).GetPrim())
     define_fabric_material(stage, FABRIC_PATH, fabric, meters_per_uv=meters_per_uv)
     return export_layer(stage.GetRootLayer(), path, overwrite=overwrite)
 
 
-def _relative(file: str, folder: Path) -> str:
+def relative_path(file: str, folder: Path) -> str:
     """``file`` as seen from ``folder``, with forward slashes, so that both can be moved together."""
     if not file:
         return ""
@@ -98,8 +98,8 @@ def define_fabric_material(
         raise UsdfabError(f"a {prim.GetTypeName()} is in the fabric's place", place=site(stage, path))
     if not (np.isfinite(meters_per_uv) and meters_per_uv >= 0):
         raise UsdfabError(f"{meters_per_uv} is not a length of 0 or more", place="meters_per_uv")
-    values = _fabric_values(fabric, meters_per_uv)
-    _check_texts(values)
+    values = fabric_values(fabric, meters_per_uv)
+    check_texts(values)
     material = UsdShade.Material.Define(stage, path)
     prim = material.GetPrim()
     prim.ApplyAPI(FABRIC_API)
@@ -116,7 +116,8 @@ def define_fabric_material(
     return material
 
 
-def _fabric_values(fabric: FabricParameters, meters_per_uv: float) -> dict[str, Any]:
+def fabric_values(fabric: FabricParameters, meters_per_uv: float) -> dict[str, Any]:
+    """Python values of all ``FABRIC_ATTRIBUTES`` by their names."""
     values = {a.name: getattr(fabric.provenance, a.field) for a in FABRIC_ATTRIBUTES if a.group == "Provenance"}
     return values | {
         "schemaVersion": SCHEMA_VERSION,
@@ -132,7 +133,8 @@ def _fabric_values(fabric: FabricParameters, meters_per_uv: float) -> dict[str, 
     }
 
 
-def _check_texts(values: Mapping[str, Any]) -> None:
+def check_texts(values: Mapping[str, Any]) -> None:
+    """``UsdfabError`` if a text among the values holds characters that USD files cannot store."""
     for name, value in values.items():
         for text in [value] if isinstance(value, str) else value if isinstance(value, tuple) else []:
             if not isinstance(text, str):
@@ -144,7 +146,7 @@ def _check_texts(values: Mapping[str, Any]) -> None:
                 )
 
 
-_TO_USD: dict[str, Any] = {
+TO_USD: dict[str, Any] = {
     "int": int,
     "double": float,
     "string": str,
@@ -156,12 +158,13 @@ _TO_USD: dict[str, Any] = {
     "string[]": lambda v: Vt.StringArray(v),
     "color3d[]": lambda v: Vt.Vec3dArray([Gf.Vec3d(*map(float, c)) for c in v]),
 }
+"""From a Python value to USD's, by the attribute's type name."""
 
 
 def _author(prim: Usd.Prim, name: str, attribute: SchemaAttribute, value: Any) -> None:
     type_name = Sdf.ValueTypeNames.Find(attribute.type_name)
     created = prim.CreateAttribute(name, type_name, custom=False, variability=Sdf.VariabilityUniform)
-    created.Set(_TO_USD[attribute.type_name](value))
+    created.Set(TO_USD[attribute.type_name](value))
 
 
 def _weighted(fabric: FabricParameters, warp: float, weft: float) -> float:
@@ -193,19 +196,24 @@ def preview_roughness(fabric: FabricParameters) -> float:
     return _weighted(fabric, warp, weft)
 
 
-def _define_preview(stage: Usd.Stage, material: UsdShade.Material, fabric: FabricParameters) -> None:
-    shader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Preview"))
-    shader.CreateIdAttr("UsdPreviewSurface")
+def preview_values(fabric: FabricParameters) -> list[tuple[str, Sdf.ValueTypeName, Any]]:
+    """Name, type and value of the preview surface's inputs; colours as tuples."""
     types = Sdf.ValueTypeNames
-    for name, type_name, value in (
-        ("diffuseColor", types.Color3f, Gf.Vec3f(*preview_color(fabric))),
+    return [
+        ("diffuseColor", types.Color3f, preview_color(fabric)),
         ("roughness", types.Float, preview_roughness(fabric)),
         ("metallic", types.Float, 0.0),
         ("ior", types.Float, _weighted(fabric, fabric.warp.ior, fabric.weft.ior)),
         ("opacity", types.Float, 1.0),
-    ):
-        shader.CreateInput(name, type_name).Set(value)
-    surface = shader.CreateOutput("surface", types.Token)
+    ]
+
+
+def _define_preview(stage: Usd.Stage, material: UsdShade.Material, fabric: FabricParameters) -> None:
+    shader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Preview"))
+    shader.CreateIdAttr("UsdPreviewSurface")
+    for name, type_name, value in preview_values(fabric):
+        shader.CreateInput(name, type_name).Set(Gf.Vec3f(*value) if isinstance(value, tuple) else value)
+    surface = shader.CreateOutput("surface", Sdf.ValueTypeNames.Token)
     material.CreateSurfaceOutput().ConnectToSource(surface)
 
 
@@ -367,25 +375,3 @@ def _at(prim: Usd.Prim, name: str | Mapping[str, str]) -> Iterator[None]:
         attribute = name if isinstance(name, str) else name.get(error.place, "")
         place = _attribute_site(prim, attribute) if attribute else site(prim.GetStage(), prim)
         raise UsdfabError(error.problem, place=place, remedy=error.remedy) from error
-
-
-# --- editing ---------------------------------------------------------------------------------------------------------
-
-
-def edit_fabric(
-    path: str | Path, settings: Mapping[str, str], out: str | Path, *, overwrite: bool = False
-) -> FabricParameters:
-    """Read the fabric of ``path``, apply ``settings`` (``usdfab.fabric.edited``), write it to ``out``, return it.
-
-    The metres per uv of the file are kept.
-
-    Raises
-    ------
-    UsdfabError
-        As ``read_fabric``, ``usdfab.fabric.edited`` and ``write_fabric``.
-    """
-    stage = open_stage(path)
-    prim = find_fabric(stage)
-    fabric = edited(fabric_from_prim(prim), settings)
-    write_fabric(fabric, out, meters_per_uv=meters_per_uv_from_prim(prim), overwrite=overwrite)
-    return fabric
