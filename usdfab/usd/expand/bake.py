@@ -20,7 +20,7 @@ from usdfab.usd.expand.surface import ClothSurface
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_BISECTIONS = 24
+_BISECTIONS = 14
 _POINTS_AT_ONCE = 2_000_000
 
 
@@ -136,7 +136,6 @@ def _clipped(
     of_chart = chart[owner // count]
     start = _crossing(surface, of_chart[first], local[first], local[np.maximum(first - 1, 0)], cut_first, region)
     stop = _crossing(surface, of_chart[last], local[last], local[np.minimum(last + 1, number - 1)], cut_last, region)
-    # First and last control point of a curve are spare: where only they are outside, nothing is cut off.
     lengths = (last - first + 1) + 2 * cut_first + 2 * cut_last
     run = np.repeat(np.arange(len(first)), lengths)
     within = np.arange(len(run)) - np.repeat(np.cumsum(lengths) - lengths, lengths)

@@ -31,7 +31,7 @@ from usdfab.usd.expand.bake import bake_curves
 from usdfab.usd.expand.centres import estimate
 from usdfab.usd.expand.curves import FiberCurves, tile_curves
 from usdfab.usd.expand.divide import divide
-from usdfab.usd.expand.frames import Frames, poses
+from usdfab.usd.expand.frames import MAX_SHEAR, Frames, poses
 from usdfab.usd.expand.instances import Cloth, Written, write_instancer, write_xforms
 from usdfab.usd.expand.layer import editable, new_layer, relative_path, replace_mesh
 from usdfab.usd.expand.place import Box, Pieces, Tint, place_pieces
@@ -55,11 +55,18 @@ MAX_XFORMS = 500_000
 MAX_POINTS = 30_000_000
 """The same for the control points of ``baked``: some 400 MB."""
 
-TOLERANCE = 4.0
-"""How far pieces may be from the surface, in fiber radii: a tenth of a typical yarn's width."""
+TOLERANCE = 2.0
+"""How far pieces may be from the surface, in fiber radii: a twentieth of a typical yarn's width."""
 
 OVERLAP = 3.0
 """By how many fiber radii fibers of pieces go on beyond the piece."""
+
+SHEAR_STEPS = 4.0
+"""Steps of the smallest pieces' shear, in tolerances over their height: what rounding it moves the corners by is less
+than the tolerance."""
+
+INSTANCED_VERTICES = 24
+"""Control points on each run of a yarn in prototypes: within half a fiber radius of many more."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +81,8 @@ class ExpandOptions:
         (u0, v0, u1, v1) in the mesh's texture coordinates as the renderer sees them: only what lies there. Baked curves
         are cut at it, pieces belong to it by their centres.
     vertices_per_segment:
-        Control points for each run of a yarn on one side.
+        Control points for each run of a yarn on one side; None: ``INSTANCED_VERTICES``, or as many as the renderer has
+        where baked.
     tolerance: fiber radii
         How far pieces may be from the surface at their corners before they are divided.
     overlap: fiber radii
@@ -87,7 +95,7 @@ class ExpandOptions:
 
     mode: Mode = "instancer"
     region: Box | None = None
-    vertices_per_segment: int = PATH_TRACING_VERTICES
+    vertices_per_segment: int | None = None
     tolerance: float = TOLERANCE
     overlap: float = OVERLAP
     purpose: Purpose = "default"
@@ -113,6 +121,12 @@ class ExpandOptions:
             if not (np.isfinite(self.region).all() and u0 < u1 and v0 < v1):
                 raise UsdfabError("the region is empty", place="--region", remedy="write u0,v0,u1,v1, lower ends first")
         return self
+
+    @property
+    def vertices(self) -> int:
+        """Control points on each run of a yarn."""
+        default = PATH_TRACING_VERTICES if self.mode == "baked" else INSTANCED_VERTICES
+        return default if self.vertices_per_segment is None else self.vertices_per_segment
 
     @property
     def most(self) -> int:
@@ -257,7 +271,7 @@ class _Writer:
         """The tile of a fabric, its variants and divisions."""
         if fabric not in self.cloths:
             copies = tile_copies(fabric)
-            patches = patch_variants(fabric, self.options.vertices_per_segment, copies)
+            patches = patch_variants(fabric, self.options.vertices, copies)
             picks, ends = fabric.repeat()
             tiling = divide((ends * copies[0], picks * copies[1]), fabric.cell, len(patches))
             finest = min(y.effective_fiber_radius for y in (fabric.warp, fabric.weft))
@@ -306,20 +320,26 @@ class _Writer:
     ) -> None:  # fmt: skip
         fabric, exact = surface.fabric, self.options.mode == "xform"
         finest = min(y.effective_fiber_radius for y in (fabric.warp, fabric.weft))
+        tolerance = self.options.tolerance * finest
+        # Sheared pieces are divided; only the smallest come in several shears, so that the file stays small.
+        steps = np.full(len(cloth.tiling.levels), 4.0 * MAX_SHEAR)
+        height = float(np.diff(cloth.tiling.levels[-1].y).max()) * cloth.tiling.cell[1]
+        steps[-1] = min(SHEAR_STEPS * tolerance / height, MAX_SHEAR)
         parts: list[Pieces] = []
         charts = 0
         for place in places:
             before = self.total.instances + sum(len(p) for p in parts)
             found = place_pieces(
-                place, cloth.tiling, self.options.tolerance * finest, 2.0 * (fabric.warp.radius + fabric.weft.radius),
-                tint, region, shear=exact, limit=lambda more, before=before: self._limit(mesh, before, more),
+                place, cloth.tiling, tolerance, 2.0 * (fabric.warp.radius + fabric.weft.radius),
+                tint, region, shear_steps=None if exact else steps,
+                limit=lambda more, before=before: self._limit(mesh, before, more),
             )  # fmt: skip
             parts.append(replace(found, chart=found.chart + charts))
             charts += int(place.chart.max(initial=0)) + 1
         pieces = Pieces.joined(parts) if parts else None
         if pieces is None or len(pieces) == 0:
             return
-        posed = poses(pieces.frames)
+        posed = poses(pieces.frames, steps[pieces.level])
         frames = pieces.frames if exact else Frames(pieces.frames.centers, posed.linear)
         self._worst(measure_seams(pieces, frames, cloth.tiling, fabric))
         centre = pieces.frames.centers.mean(axis=0)

@@ -18,10 +18,9 @@ from usdfab.usd.expand.surface import ClothSurface, Places, unit
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SHEAR_STEP = 0.03
-"""Instances scale and turn but cannot shear, so prototypes come in several shears, this far apart (tangents)."""
-
 MAX_SHEAR = 1.5
+"""Tangent of the greatest shear that prototypes have."""
+
 SMALLEST, LARGEST = 1e-3, 1e3
 """World per metre of cloth: pieces stretched beyond this are left out."""
 
@@ -53,20 +52,23 @@ class Frames:
 class Poses:
     """Frames in the parts that instances have: ``linear`` = rotation * scale * shear of x by y.
 
-    ``rotations`` (N, 3, 3) proper; ``scales`` (N, 3), the second negative where uv is mirrored; ``shear`` (N,) in steps
-    of ``SHEAR_STEP``.
+    Instances scale and turn but cannot shear, so prototypes come in several shears.
+
+    ``rotations`` (N, 3, 3) proper; ``scales`` (N, 3), the second negative where uv is mirrored; ``shear`` (N,) in whole
+    steps, each ``step`` (N,) of tangent.
     """
 
     rotations: Floats
     scales: Floats
     shear: Ints
+    step: Floats
 
     @property
     def linear(self) -> Floats:
         """(N, 3, 3) the frames' matrices, with the shear rounded to its steps."""
         skew = np.zeros((len(self.shear), 3, 3))
         skew[:, 0, 0] = skew[:, 1, 1] = skew[:, 2, 2] = 1.0
-        skew[:, 0, 1] = self.shear * SHEAR_STEP
+        skew[:, 0, 1] = self.shear * self.step
         return self.rotations @ (self.scales[:, :, None] * skew)
 
 
@@ -119,14 +121,17 @@ def regular(frames: Frames) -> NDArray[np.bool_]:
     return upright & (np.minimum(sx, sy) > SMALLEST) & (np.maximum(sx, sy) < LARGEST)
 
 
-def poses(frames: Frames) -> Poses:
-    """The frames as rotation, scale and shear in steps."""
+def poses(frames: Frames, step: Floats) -> Poses:
+    """The frames as rotation, scale and shear in steps of ``step`` (N,), tangents."""
     x, y, z = (frames.linear[:, :, k] for k in range(3))
     sx = np.linalg.norm(x, axis=1)
     first, third = unit(x), unit(z)
     second = np.cross(third, first)
     sy = np.einsum("nx,nx->n", y, second)
     skew = np.einsum("nx,nx->n", y, first) / sx
-    shear = np.rint(np.clip(skew, -MAX_SHEAR, MAX_SHEAR) / SHEAR_STEP).astype(np.int64)
+    shear = np.rint(np.clip(skew, -MAX_SHEAR, MAX_SHEAR) / step).astype(np.int64)
+    # What rounding leaves is shared between warp and weft: both turn by half of it.
+    half = 0.5 * np.arctan((skew - shear * step) * sx / np.where(sy == 0.0, 1.0, sy))[:, None]
+    one, two = np.cos(half) * first - np.sin(half) * second, np.sin(half) * first + np.cos(half) * second
     scales = np.stack([sx, sy, np.linalg.norm(z, axis=1)], axis=1)
-    return Poses(np.stack([first, second, third], axis=2), scales, shear)
+    return Poses(np.stack([one, two, third], axis=2), scales, shear, step)

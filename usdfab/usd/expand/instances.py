@@ -14,7 +14,7 @@ from usdfab.fibers.tiles import tile_variants
 from usdfab.usd.expand.author import author_curves, fiber_facts, mean_color
 from usdfab.usd.expand.curves import FiberCurves, piece_curves
 from usdfab.usd.expand.divide import Tiling
-from usdfab.usd.expand.frames import SHEAR_STEP, Poses
+from usdfab.usd.expand.frames import Poses
 from usdfab.usd.expand.place import Pieces
 
 
@@ -44,13 +44,13 @@ def write_instancer(
 ) -> Written:  # fmt: skip
     """A PointInstancer ``Patches`` below ``root`` with a copy of a prototype for each piece.
 
-    Copies turn and scale; what they shear is in the prototypes, as a matrix in steps of ``SHEAR_STEP``.
+    Copies turn and scale; what they shear is in the points of prototypes, in steps.
     """
     instancer = UsdGeom.PointInstancer.Define(stage, root.GetPath().AppendChild("Patches"))
     Usd.ModelAPI(instancer).SetKind(Kind.Tokens.subcomponent)
     holder = instancer.GetPath().AppendChild("Prototypes")
     kinds = np.column_stack([_kinds(cloth, pieces), poses.shear])
-    targets, index, written = _prototypes(stage, holder, cloth, kinds, meters, material)
+    targets, index, written = _prototypes(stage, holder, cloth, kinds, poses.step, meters, material)
     instancer.CreatePrototypesRel().SetTargets(targets)
     instancer.CreateProtoIndicesAttr(Vt.IntArray.FromNumpy(index.astype(np.int32)))
     positions = ((pieces.frames.centers - centre) / meters).astype(np.float32)
@@ -81,7 +81,7 @@ def write_xforms(
     parent = UsdGeom.Scope.Define(stage, root.GetPath().AppendChild("Patches")).GetPath()
     holder = root.GetPath().AppendChild("Prototypes")
     kinds = np.column_stack([_kinds(cloth, pieces), np.zeros(len(pieces), dtype=np.int64)])
-    targets, index, written = _prototypes(stage, holder, cloth, kinds, meters, material)
+    targets, index, written = _prototypes(stage, holder, cloth, kinds, np.zeros(len(pieces)), meters, material)
     matrices = np.zeros((len(pieces), 4, 4))
     # USD's row vectors: the frame's columns are rows.
     matrices[:, :3, :3] = np.swapaxes(pieces.frames.linear, 1, 2)
@@ -129,42 +129,36 @@ def _tint(instancer: UsdGeom.PointInstancer, tint: np.ndarray, cloth: Cloth) -> 
 
 
 def _prototypes(
-    stage: Usd.Stage, holder: Sdf.Path, cloth: Cloth, kinds: np.ndarray, meters: float, material: UsdShade.Material
+    stage: Usd.Stage,
+    holder: Sdf.Path,
+    cloth: Cloth,
+    kinds: np.ndarray,
+    step: np.ndarray,
+    meters: float,
+    material: UsdShade.Material,
 ) -> tuple[list[Sdf.Path], np.ndarray, Written]:
-    """Prototypes for rows (variant, level, part x, part y, shear): their paths, and (N,) which one each row needs."""
+    """Prototypes for rows (variant, level, part x, part y, shear): their paths, and (N,) which one each row needs.
+
+    Shear is in the points: not every program has transforms that shear (Blender has none).
+    """
     UsdGeom.Scope.Define(stage, holder)
-    unique, index = np.unique(kinds, axis=0, return_inverse=True)
-    first: dict[tuple[int, ...], Sdf.Path] = {}
+    unique, where, index = np.unique(kinds, axis=0, return_index=True, return_inverse=True)
     written, targets = Written(prototypes=len(unique)), []
-    for variant, number, i, j, shear in unique.tolist():
-        name = f"Variant{variant}_Level{number}_{i}_{j}"
+    for (variant, number, i, j, shear), row in zip(unique.tolist(), where.tolist(), strict=True):
+        name = f"Variant{variant}" + (f"_Level{number}_{i}_{j}" if number else "")
         name += "" if shear == 0 else f"_Shear{'m' if shear < 0 else ''}{abs(shear)}"
-        prototype = UsdGeom.Xform.Define(stage, holder.AppendChild(name))
-        # The matrix stands below the prototype's root, whose own transform not every program applies.
-        fibers = prototype.GetPath().AppendChild("Fibers")
-        targets.append(prototype.GetPath())
-        known = first.get((variant, number, i, j))
-        if known is None:
-            first[variant, number, i, j] = prototype.GetPath()
-            UsdGeom.Xform.Define(stage, fibers)
-            level = cloth.tiling.levels[number]
-            cells = (int(level.x[i]), int(level.x[i + 1])), (int(level.y[j]), int(level.y[j + 1]))
-            for tile in cloth.variants[variant]:
-                part = piece_curves(tile, cloth.tiling, cells, cloth.overlap)
-                if len(part.counts):
-                    facts = fiber_facts(cloth.fabric, part.system, str(material.GetPath()) if material else "")
-                    author_curves(stage, fibers.AppendChild(part.name), part, meters, material, facts)
-                    written.curves += len(part.counts)
-                    written.points += len(part.points)
-        else:
-            prototype.GetPrim().GetReferences().AddInternalReference(known)
-            stage.OverridePrim(fibers)
-        matrix = Gf.Matrix4d(1.0)
-        matrix[1, 0] = shear * SHEAR_STEP
-        if shear or known is not None:
-            xform = UsdGeom.Xform(stage.GetPrimAtPath(fibers))
-            if known is None:
-                xform.AddTransformOp().Set(matrix)
-            else:
-                xform.MakeMatrixXform().Set(matrix)
+        prototype = UsdGeom.Xform.Define(stage, holder.AppendChild(name)).GetPath()
+        targets.append(prototype)
+        level = cloth.tiling.levels[number]
+        cells = (int(level.x[i]), int(level.x[i + 1])), (int(level.y[j]), int(level.y[j + 1]))
+        for tile in cloth.variants[variant]:
+            part = piece_curves(tile, cloth.tiling, cells, cloth.overlap)
+            if len(part.counts) == 0:
+                continue
+            if shear:
+                part.points[:, 0] += shear * step[row] * part.points[:, 1]
+            facts = fiber_facts(cloth.fabric, part.system, str(material.GetPath()) if material else "")
+            author_curves(stage, prototype.AppendChild(part.name), part, meters, material, facts)
+            written.curves += len(part.counts)
+            written.points += len(part.points)
     return targets, index.ravel(), written

@@ -70,7 +70,7 @@ def place_pieces(
     tint: Tint,
     region: Box | None = None,
     *,
-    shear: bool = True,
+    shear_steps: Floats | None = None,
     limit: Callable[[int], None] = lambda count: None,
 ) -> Pieces:
     """Put a tile's pieces on a surface.
@@ -83,8 +83,8 @@ def place_pieces(
         Of the cloth: at half of it above and below, pieces that lean against each other may open as much.
     region:
         (x0, y0, x1, y1) metres of cloth: only pieces whose centre lies there.
-    shear:
-        Whether frames are used as they are; else as ``poses`` rounds them.
+    shear_steps: (levels,) tangents
+        How finely the prototypes of each level are sheared (``poses``); None: frames are used as they are.
     limit:
         Called with the number of pieces so far; raises where they are too many.
     """
@@ -115,7 +115,9 @@ def place_pieces(
         colors = tint(center.uv, center.tint)
         good = regular(frames)
         if not last_level:
-            used = frames if shear else Frames(frames.centers, poses(frames).linear)
+            used = frames
+            if shear_steps is not None:
+                used = Frames(frames.centers, poses(frames, np.full(len(here), shear_steps[number])).linear)
             error = _error(used, corners, there.normals, center.points, (high - low)[here], thickness, tolerance)
             around = tint(there.uv, there.tint).reshape(-1, 4, 3)
             change = np.abs(around - colors[:, None]).max(axis=(1, 2))

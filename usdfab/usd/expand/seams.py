@@ -24,7 +24,7 @@ class Seams:
 
     ``median``, ``p99`` and ``largest`` are those in the cloth's mid-surface; ``face_p99`` and ``face_largest`` those at
     the outside of the yarns, where pieces of bent cloth open and overlapping ends close the gap. ``fiber_radius`` and
-    ``yarn_width`` are for comparison. ``count``: how many ends were measured.
+    ``yarn_width`` are for comparison. ``count``: how many ends were measured. ``place``: where the largest is, metres.
     """
 
     median: float
@@ -35,6 +35,7 @@ class Seams:
     fiber_radius: float
     yarn_width: float
     count: int
+    place: tuple[float, float, float]
 
 
 def measure_seams(pieces: Pieces, frames: Frames, tiling: Tiling, fabric: FabricParameters) -> Seams | None:
@@ -70,13 +71,17 @@ def measure_seams(pieces: Pieces, frames: Frames, tiling: Tiling, fabric: Fabric
     one, two = order[same], order[same + 1]
     radius = {0: fabric.weft.radius, 1: fabric.warp.radius}
     height = np.where(key[one, 1] == 0, radius[0], radius[1])
-    gaps = []
+    gaps, middle = [], np.zeros((len(one), 3))
     for side in (0.0, 1.0, -1.0):
         up = np.array([0.0, 0.0, 1.0]) * (side * height)[:, None]
         ends = [frames[owner[k]].at(place[k] + up) for k in (one, two)]
+        middle = ends[0] if side == 0.0 else middle
         gaps.append(np.linalg.norm(ends[0] - ends[1], axis=1))
     faces = np.maximum(gaps[1], gaps[2])
     middle_gap = np.percentile(gaps[0], [50, 99, 100])
     width = 2.0 * min(y.radius * y.flattening for y in (fabric.warp, fabric.weft))
     fiber = min(y.effective_fiber_radius for y in (fabric.warp, fabric.weft))
-    return Seams(*map(float, middle_gap), *map(float, np.percentile(faces, [99, 100])), fiber, width, len(one))
+    x, y, z = map(float, middle[int(faces.argmax())])
+    return Seams(
+        *map(float, middle_gap), *map(float, np.percentile(faces, [99, 100])), fiber, width, len(one), (x, y, z)
+    )

@@ -86,7 +86,7 @@ class ClothSurface:
         else:
             self.normals = normals[keep]
         self.mirrored = determinant < 0
-        self._determinant = determinant
+        self._inverse = np.stack([b[:, 1], -b[:, 0], -a[:, 1], a[:, 0]], axis=1) / determinant[:, None]
         corner = _corners(mesh.triangles[keep], self.xy, self.mirrored)
         self.chart, self.border = _charts(corner)
         square = area[keep] / np.abs(determinant)
@@ -145,12 +145,10 @@ class ClothSurface:
         )
 
     def weights(self, triangle: Ints, xy: Floats) -> Floats:
-        """(N, 3) barycentric coordinates."""
-        corners = self.xy[triangle]
-        a, b, q = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], xy - corners[:, 0]
-        determinant = self._determinant[triangle]
-        one = (q[:, 0] * b[:, 1] - q[:, 1] * b[:, 0]) / determinant
-        two = (q[:, 1] * a[:, 0] - q[:, 0] * a[:, 1]) / determinant
+        """(N, 3) barycentric coordinates of places (N, 2); not bounded, triangles go on as planes."""
+        q, inverse = xy - self.xy[triangle, 0], self._inverse[triangle]
+        one = q[:, 0] * inverse[:, 0] + q[:, 1] * inverse[:, 1]
+        two = q[:, 0] * inverse[:, 2] + q[:, 1] * inverse[:, 3]
         return np.stack([1.0 - one - two, one, two], axis=1)
 
 
@@ -197,7 +195,8 @@ class _Grid:
     def __init__(self, xy: Floats, chart: Ints) -> None:
         low, high = xy.min(axis=1), xy.max(axis=1)
         box = (high - low).prod(axis=1)
-        self.side = float(np.sqrt(box.mean())) if len(xy) else 1.0
+        # Half a box: fewer triangles that do not hold the place, for twice the memory.
+        self.side = 0.5 * float(np.sqrt(box.mean())) if len(xy) else 1.0
         self.origin = low.min(axis=0) if len(xy) else np.zeros(2)
         first, last = self._cell(low), self._cell(high)
         self.shape = last.max(axis=0) + 1 if len(xy) else np.ones(2, dtype=np.int64)
