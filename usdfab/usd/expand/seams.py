@@ -24,7 +24,8 @@ class Seams:
 
     ``median``, ``p99`` and ``largest`` are those in the cloth's mid-surface; ``face_p99`` and ``face_largest`` those at
     the outside of the yarns, where pieces of bent cloth open and overlapping ends close the gap. ``fiber_radius`` and
-    ``yarn_width`` are for comparison. ``count``: how many ends were measured. ``place``: where the largest is, metres.
+    ``yarn_width`` are for comparison. ``count``: how many ends were measured. ``place``: where the
+    largest is, metres; ``normal``: where the cloth's front looks there.
     """
 
     median: float
@@ -36,6 +37,7 @@ class Seams:
     yarn_width: float
     count: int
     place: tuple[float, float, float]
+    normal: tuple[float, float, float]
 
 
 def measure_seams(pieces: Pieces, frames: Frames, tiling: Tiling, fabric: FabricParameters) -> Seams | None:
@@ -81,7 +83,11 @@ def measure_seams(pieces: Pieces, frames: Frames, tiling: Tiling, fabric: Fabric
     middle_gap = np.percentile(gaps[0], [50, 99, 100])
     width = 2.0 * min(y.radius * y.flattening for y in (fabric.warp, fabric.weft))
     fiber = min(y.effective_fiber_radius for y in (fabric.warp, fabric.weft))
-    x, y, z = map(float, middle[int(faces.argmax())])
+    worst = int(faces.argmax())
+    x, y, z = map(float, middle[worst])
+    up = frames.linear[owner[one[worst]], :, 2]
+    a, b, c = map(float, up / np.linalg.norm(up))
     return Seams(
-        *map(float, middle_gap), *map(float, np.percentile(faces, [99, 100])), fiber, width, len(one), (x, y, z)
-    )
+        *map(float, middle_gap), *map(float, np.percentile(faces, [99, 100])), fiber, width, len(one),
+        (x, y, z), (a, b, c),
+    )  # fmt: skip
