@@ -27,6 +27,8 @@ MAX_TINT_CHANGE = 0.04
 """A piece has one colour: one whose corners differ more than this is divided."""
 
 _MAX_SAMPLES = 20_000_000
+_BETWEEN = 1e-5
+"""Borders this near to the line between two cells, in cells, run between them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +163,8 @@ def _error(
 
 
 def border_cells(surface: ClothSurface, tiling: Tiling) -> Ints:
-    """(M, 3) chart, column and row of the cells of the weave in which a border of the cloth runs."""
+    """(M, 5) where borders of the cloth run: chart, and column and row of the cells of the weave on both sides, which are
+    the same unless a border runs exactly between them."""
     triangle, edge = surface.border
     start, end = surface.xy[triangle, edge], surface.xy[triangle, (edge + 1) % 3]
     cell = np.asarray(tiling.cell)
@@ -171,10 +174,9 @@ def border_cells(surface: ClothSurface, tiling: Tiling) -> Ints:
     owner = np.repeat(np.arange(len(start)), steps)
     share = (np.arange(len(owner)) - np.repeat(np.cumsum(steps) - steps, steps) + 0.5) / steps[owner]
     place = (start[owner] + share[:, None] * (end - start)[owner]) / cell
-    # A border that runs exactly between cells cuts none of them.
-    inside = (np.abs(place - np.rint(place)) > 1e-5).all(axis=1)
-    cells = np.floor(place[inside]).astype(np.int64)
-    return np.unique(np.column_stack([surface.chart[triangle[owner[inside]]], cells]), axis=0)
+    # A border that runs exactly between cells cuts neither, but a piece that holds both.
+    first, last = np.floor(place - _BETWEEN).astype(np.int64), np.floor(place + _BETWEEN).astype(np.int64)
+    return np.unique(np.column_stack([surface.chart[triangle[owner]], first, last]), axis=0)
 
 
 def candidates(surface: ClothSurface, tiling: Tiling, border: Ints, region: Box | None) -> Ints:
@@ -182,10 +184,11 @@ def candidates(surface: ClothSurface, tiling: Tiling, border: Ints, region: Box 
     size = np.asarray(tiling.size)
     triangle, index = centres_inside(surface.xy, size)
     tiles = np.column_stack([surface.chart[triangle], index])
-    cut = np.column_stack([border[:, 0], border[:, 1:] // np.asarray(tiling.cells)])
+    first, last = border[:, 1:3] // np.asarray(tiling.cells), border[:, 3:] // np.asarray(tiling.cells)
+    cut = np.column_stack([border[:, 0], first])[(first == last).all(axis=1)]
     if region is not None:
-        first, last = np.floor(np.array(region[:2]) / size), np.floor(np.array(region[2:]) / size)
-        tiles, cut = (t[((t[:, 1:] >= first) & (t[:, 1:] <= last)).all(axis=1)] for t in (tiles, cut))
+        lowest, highest = np.floor(np.array(region[:2]) / size), np.floor(np.array(region[2:]) / size)
+        tiles, cut = (t[((t[:, 1:] >= lowest) & (t[:, 1:] <= highest)).all(axis=1)] for t in (tiles, cut))
     return np.unique(np.concatenate([tiles, cut]), axis=0)
 
 
@@ -193,9 +196,12 @@ def _holds(border: Ints, chart: Ints, tile: Ints, part: Ints, x: Ints, y: Ints, 
     """Whether a border runs through each piece."""
     if len(border) == 0:
         return np.zeros(len(chart), dtype=bool)
-    own, local = np.divmod(border[:, 1:], np.asarray(cells))
-    parts = np.stack([np.searchsorted(x, local[:, 0], "right"), np.searchsorted(y, local[:, 1], "right")], axis=1) - 1
-    cut = np.unique(np.column_stack([border[:, 0], own, parts]), axis=0)
+    sides = []
+    for cell in (border[:, 1:3], border[:, 3:]):
+        own, local = np.divmod(cell, np.asarray(cells))
+        i, j = np.searchsorted(x, local[:, 0], "right") - 1, np.searchsorted(y, local[:, 1], "right") - 1
+        sides.append(np.column_stack([border[:, 0], own, i, j]))
+    cut = np.unique(sides[0][(sides[0] == sides[1]).all(axis=1)], axis=0)
     both = np.concatenate([cut, np.column_stack([chart, tile, part])])
     number = np.unique(both, axis=0, return_inverse=True)[1].ravel()
     return np.isin(number[len(cut) :], number[: len(cut)])
