@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, YarnParameters, preset
 from usdfab.fibers import generate_patch
-from usdfab.fibers.tiles import tile_copies, tile_variants
+from usdfab.fibers.tiles import tile_copies
 from usdfab.usd.check import check
 from usdfab.usd.expand import ExpandOptions, expand
 from usdfab.usd.fabric_io import define_fabric_material, read_fabric

@@ -37,7 +37,7 @@ def grid(n: int, shape=lambda u, v: np.stack([u, v, 0 * u], axis=-1), turn: floa
     """(points, uv, triangles) of a unit square of n x n quads put through ``shape``, its uv turned."""
     v, u = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1), indexing="ij")
     first = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).reshape(-1, 1)
-    triangles = np.concatenate([first + [0, 1, n + 2], first + [0, n + 2, n + 1]])
+    triangles = np.concatenate([first + np.array(c) for c in ([0, 1, n + 2], [0, n + 2, n + 1])])
     rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     return shape(u.ravel(), v.ravel()), np.column_stack([u.ravel(), v.ravel()]) @ rotation.T, triangles
 
@@ -198,7 +198,8 @@ def test_charts_and_places():
     triangle, found = surface.locate(surface.chart[owner], xy)
     np.testing.assert_array_equal(triangle, owner)
     np.testing.assert_allclose(found, weights, atol=1e-9)
-    np.testing.assert_allclose(surface.at(triangle, found).points, np.einsum("nc,ncx->nx", weights, points[triangles[owner]]), atol=1e-12)  # fmt: skip
+    expected = np.einsum("nc,ncx->nx", weights, points[triangles[owner]])
+    np.testing.assert_allclose(surface.at(triangle, found).points, expected, atol=1e-12)
     assert (surface.locate(surface.chart[owner], xy + 40.0)[0] == -1).all()
 
 

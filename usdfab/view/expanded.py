@@ -25,9 +25,7 @@ TILT = 0.5
 BACKGROUND = (0.06, 0.06, 0.07)
 
 
-def screenshot_of(
-    result: Expansion, path: str | Path, resolution: tuple[int, int], *, overwrite: bool = False
-) -> Path:
+def screenshot_of(result: Expansion, path: str | Path, resolution: tuple[int, int], *, overwrite: bool = False) -> Path:
     """Draw what ``usdfab.usd.expand`` wrote, where its pieces meet worst, into a picture file.
 
     Raises

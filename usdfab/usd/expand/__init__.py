@@ -5,8 +5,8 @@ from usdfab.usd.expand.command import (
     MAX_POINTS as MAX_POINTS,
     MAX_XFORMS as MAX_XFORMS,
     TOLERANCE as TOLERANCE,
-    Expansion as Expansion,
     ExpandOptions as ExpandOptions,
+    Expansion as Expansion,
     TextureReader as TextureReader,
     expand as expand,
 )

@@ -132,7 +132,7 @@ def _clipped(
     cut_first, cut_last = same_before[first], same_after[last]
     # A lone point at a cut is no curve.
     long = (last - first + 1) + cut_first + cut_last >= 3
-    first, last, cut_first, cut_last = (a[long] for a in (first, last, cut_first, cut_last))
+    first, last, cut_first, cut_last = first[long], last[long], cut_first[long], cut_last[long]
     of_chart = chart[owner // count]
     start = _crossing(surface, of_chart[first], local[first], local[np.maximum(first - 1, 0)], cut_first, region)
     stop = _crossing(surface, of_chart[last], local[last], local[np.minimum(last + 1, number - 1)], cut_last, region)
@@ -154,7 +154,7 @@ def _clipped(
 
 
 def _crossing(
-    surface: ClothSurface, chart: Ints, inside: Floats, outside: Floats, cut: NDArray[np.bool_], region: Box | None
+    surface: ClothSurface, chart: Ints, inside: Floats, outside: Floats, cut: NDArray, region: Box | None
 ) -> Floats:
     """(N, 3) the last place inside on the line from ``inside`` to ``outside``, by bisection; only where ``cut``."""
     low, high = np.zeros(len(inside)), np.ones(len(inside))
@@ -167,9 +167,7 @@ def _crossing(
     return inside + low[:, None] * (outside - inside)
 
 
-def _carried(
-    surface: ClothSurface, run: Ints, local: Floats, triangle: Ints, weights: Floats
-) -> tuple[Ints, Floats]:
+def _carried(surface: ClothSurface, run: Ints, local: Floats, triangle: Ints, weights: Floats) -> tuple[Ints, Floats]:
     """Places beyond the border (the last control points of clipped curves) go on in their neighbour's triangle."""
     for shift in (1, -1, 2, -2):
         lost = np.flatnonzero(triangle < 0)
@@ -188,11 +186,8 @@ def _joined(parts: list[FiberCurves]) -> FiberCurves:
     first = parts[0]
     colors = [p.color for p in parts]
     if any(len(p.color) == len(p.points) for p in parts):
-        colors = [
-            p.color if len(p.color) == len(p.points) else np.repeat(p.color, p.counts, axis=0) for p in parts
-        ]
-    return FiberCurves(
-        first.name, first.system, *(np.concatenate([getattr(p, n) for p in parts])
-                                    for n in ("points", "counts", "yarn", "fiber")),
-        np.concatenate(colors), first.radius,
-    )  # fmt: skip
+        colors = [p.color if len(p.color) == len(p.points) else np.repeat(p.color, p.counts, axis=0) for p in parts]
+    points, counts, yarn, fiber = (
+        np.concatenate([getattr(p, name) for p in parts]) for name in ("points", "counts", "yarn", "fiber")
+    )
+    return FiberCurves(first.name, first.system, points, counts, yarn, fiber, np.concatenate(colors), first.radius)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -328,11 +329,10 @@ class _Writer:
         parts: list[Pieces] = []
         charts = 0
         for place in places:
-            before = self.total.instances + sum(len(p) for p in parts)
+            limit = partial(self._limit, mesh, self.total.instances + sum(len(p) for p in parts))
             found = place_pieces(
                 place, cloth.tiling, tolerance, 2.0 * (fabric.warp.radius + fabric.weft.radius),
-                tint, region, shear_steps=None if exact else steps,
-                limit=lambda more, before=before: self._limit(mesh, before, more),
+                tint, region, shear_steps=None if exact else steps, limit=limit,
             )  # fmt: skip
             parts.append(replace(found, chart=found.chart + charts))
             charts += int(place.chart.max(initial=0)) + 1
@@ -357,7 +357,7 @@ class _Writer:
         baked: list[list[FiberCurves]] = []
         for place in places:
             before = self.total.points + sum(len(c.points) for curves in baked for c in curves)
-            limit = lambda more, before=before: self._limit(mesh, before, more)  # noqa: E731
+            limit = partial(self._limit, mesh, before)
             baked.append(bake_curves(place, cloth.tiling, cloth.variants, tint, region, limit))
         everything = [c.points for curves in baked for c in curves]
         if not everything:
@@ -376,9 +376,7 @@ class _Writer:
                 written.points += len(kind.points)
         self._count(written)
 
-    def _root(
-        self, mesh: Mesh, surface: FabricSurface, centre: np.ndarray
-    ) -> tuple[UsdGeom.Xform, UsdShade.Material]:
+    def _root(self, mesh: Mesh, surface: FabricSurface, centre: np.ndarray) -> tuple[UsdGeom.Xform, UsdShade.Material]:
         """The Xform that holds the fibers of a mesh, which gives way to them, and their material."""
         prim = editable(self.stage, mesh.path)
         purpose = self.options.purpose

@@ -49,9 +49,7 @@ class Tiling:
         return self.cells[0] * self.cell[0], self.cells[1] * self.cell[1]
 
 
-def divide(
-    cells: tuple[int, int], cell: tuple[float, float], variants: int, levels: int | None = None
-) -> Tiling:
+def divide(cells: tuple[int, int], cell: tuple[float, float], variants: int, levels: int | None = None) -> Tiling:
     """The divisions of a tile; at most ``levels`` of them, and no more than ``MAX_PROTOTYPES`` allows."""
     found: list[Level] = []
     x, y = np.array([0, cells[0]]), np.array([0, cells[1]])

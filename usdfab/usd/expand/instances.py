@@ -105,7 +105,8 @@ def write_xforms(
             if tinted:
                 tint = Sdf.AttributeSpec(spec, "primvars:usdfab:albedo", Sdf.ValueTypeNames.Color3fArray)
                 tint.default = Vt.Vec3fArray([Gf.Vec3f(*map(float, pieces.tint[k]))])
-    layer.GetPrimAtPath(holder).specifier = Sdf.SpecifierOver
+    # A class, as nothing but references leads to it: an over would count as forgotten.
+    layer.GetPrimAtPath(holder).specifier = Sdf.SpecifierClass
     written.instances = len(pieces)
     return written
 

@@ -1,7 +1,7 @@
 """Where pieces of tiles go on a surface: whole tiles where it is flat, smaller pieces where it bends or ends.
 
-A tile is divided (``divide``) until its pieces lie on the surface as closely as wanted. Tiles that the cloth's border, a
-seam or the region's edge cuts are divided to the end; of their pieces those stay whose centre lies on the cloth.
+A tile is divided (``divide``) until its pieces lie on the surface as closely as wanted. Tiles that the cloth's border,
+a seam or the region's edge cuts are divided to the end; of their pieces those stay whose centre lies on the cloth.
 """
 
 from __future__ import annotations
@@ -55,13 +55,10 @@ class Pieces:
     @staticmethod
     def joined(parts: list[Pieces]) -> Pieces:
         """The pieces of several, at least one."""
-        names = ("chart", "tile", "level", "part", "first", "last")
-        frames = [p.frames for p in parts]
-        return Pieces(
-            *(np.concatenate([getattr(p, name) for p in parts]) for name in names),
-            Frames(np.concatenate([f.centers for f in frames]), np.concatenate([f.linear for f in frames])),
-            np.concatenate([p.tint for p in parts]),
-        )
+        names = ("chart", "tile", "level", "part", "first", "last", "tint")
+        arrays = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
+        centers, linear = (np.concatenate([getattr(p.frames, name) for p in parts]) for name in ("centers", "linear"))
+        return Pieces(frames=Frames(centers, linear), **arrays)
 
 
 def place_pieces(
@@ -100,12 +97,12 @@ def place_pieces(
         chart, tile = current[:, 0], current[:, 1:]
         first = tile * tiling.cells + np.stack([level.x[part[:, 0]], level.y[part[:, 1]]], axis=1)
         last = tile * tiling.cells + np.stack([level.x[part[:, 0] + 1], level.y[part[:, 1] + 1]], axis=1)
-        low, high = first * tiling.cell, last * np.asarray(tiling.cell)
+        low, high = (np.asarray(c * np.asarray(tiling.cell), dtype=np.float64) for c in (first, last))
         cut = _holds(border, chart, tile, part, level.x, level.y, tiling.cells)
         middle = 0.5 * (low + high)
         wanted = np.ones(len(low), dtype=bool)
         if region is not None:
-            wanted = ((middle >= region[:2]) & (middle < region[2:])).all(axis=1)
+            wanted = np.all((middle >= region[:2]) & (middle < region[2:]), axis=1)
             apart = (low >= region[2:]).any(axis=1) | (high <= region[:2]).any(axis=1)
             cut |= ~(apart | ((low >= region[:2]) & (high <= region[2:])).all(axis=1))
         triangle, weights = surface.locate(chart, middle)
@@ -163,8 +160,10 @@ def _error(
 
 
 def border_cells(surface: ClothSurface, tiling: Tiling) -> Ints:
-    """(M, 5) where borders of the cloth run: chart, and column and row of the cells of the weave on both sides, which are
-    the same unless a border runs exactly between them."""
+    """(M, 5) where borders of the cloth run: chart, and column and row of the cells of the weave on both sides.
+
+    These are the same unless a border runs exactly between them.
+    """
     triangle, edge = surface.border
     start, end = surface.xy[triangle, edge], surface.xy[triangle, (edge + 1) % 3]
     cell = np.asarray(tiling.cell)
@@ -192,7 +191,9 @@ def candidates(surface: ClothSurface, tiling: Tiling, border: Ints, region: Box 
     return np.unique(np.concatenate([tiles, cut]), axis=0)
 
 
-def _holds(border: Ints, chart: Ints, tile: Ints, part: Ints, x: Ints, y: Ints, cells: tuple[int, int]) -> NDArray[np.bool_]:
+def _holds(
+    border: Ints, chart: Ints, tile: Ints, part: Ints, x: Ints, y: Ints, cells: tuple[int, int]
+) -> NDArray[np.bool_]:
     """Whether a border runs through each piece."""
     if len(border) == 0:
         return np.zeros(len(chart), dtype=bool)

@@ -80,14 +80,15 @@ def measure_seams(pieces: Pieces, frames: Frames, tiling: Tiling, fabric: Fabric
         middle = ends[0] if side == 0.0 else middle
         gaps.append(np.linalg.norm(ends[0] - ends[1], axis=1))
     faces = np.maximum(gaps[1], gaps[2])
-    middle_gap = np.percentile(gaps[0], [50, 99, 100])
     width = 2.0 * min(y.radius * y.flattening for y in (fabric.warp, fabric.weft))
     fiber = min(y.effective_fiber_radius for y in (fabric.warp, fabric.weft))
     worst = int(faces.argmax())
     x, y, z = map(float, middle[worst])
     up = frames.linear[owner[one[worst]], :, 2]
     a, b, c = map(float, up / np.linalg.norm(up))
+    gap, face_gap = np.percentile(gaps[0], [50, 99, 100]), np.percentile(faces, [99, 100])
     return Seams(
-        *map(float, middle_gap), *map(float, np.percentile(faces, [99, 100])), fiber, width, len(one),
-        (x, y, z), (a, b, c),
+        median=float(gap[0]), p99=float(gap[1]), largest=float(gap[2]),
+        face_p99=float(face_gap[0]), face_largest=float(face_gap[1]),
+        fiber_radius=fiber, yarn_width=width, count=len(one), place=(x, y, z), normal=(a, b, c),
     )  # fmt: skip

@@ -7,6 +7,7 @@ ends, where texture coordinates jump (a seam), where they are mirrored, and wher
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -216,10 +217,10 @@ class _Grid:
     def _key(self, chart: Ints, cell: Ints) -> Ints:
         return (chart * self.shape[0] + cell[:, 0]) * self.shape[1] + cell[:, 1]
 
-    def candidates(self, chart: Ints, xy: Floats):  # type: ignore[no-untyped-def]
+    def candidates(self, chart: Ints, xy: Floats) -> Iterator[tuple[Ints, Ints]]:
         """(number of the place, triangle) of what may hold it, some places at a time, in their order."""
         cell = self._cell(np.clip(xy, -1e12, 1e12))
-        valid = ((cell >= 0) & (cell < self.shape)).all(axis=1)
+        valid = np.all((cell >= 0) & (cell < self.shape), axis=1)
         key = np.where(valid, self._key(chart, np.where(valid[:, None], cell, 0)), -1)
         start, stop = np.searchsorted(self.keys, key, "left"), np.searchsorted(self.keys, key, "right")
         number = stop - start
