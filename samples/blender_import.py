@@ -34,6 +34,9 @@ CURVE_STEPS = 3
 def import_stage(path: Path) -> list[bpy.types.Curves]:
     """Import a USD file into the open scene; returns the fibers, restored."""
     before = set(bpy.data.hair_curves)
+    if bpy.context.scene.world is None:
+        # Without a world the importer drops dome lights.
+        bpy.context.scene.world = bpy.data.worlds.new("World")
     if "FINISHED" not in bpy.ops.wm.usd_import(filepath=str(path)):
         raise SystemExit(f"Blender cannot import {path}")
     fibers = [c for c in bpy.data.hair_curves if c not in before and KEY in c]

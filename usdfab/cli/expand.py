@@ -99,15 +99,15 @@ def run(
 
 
 def _facts(result: Expansion, screenshot: Path | None) -> dict[str, Any]:
-    """What ``--json`` says; lengths in metres."""
+    """What ``--json`` says; lengths in metres. Baked curves count as prototypes of themselves."""
     return {
         "output": result.path,
         "mode": result.mode,
         "meshes": result.meshes,
         "instances": result.instances,
         "prototypes": result.prototypes,
-        "curves": result.curves,
-        "points": result.points,
+        "prototype_curves": result.curves,
+        "prototype_points": result.points,
         "bytes": result.path.stat().st_size,
         "seams": None if result.seams is None else asdict(result.seams),
         "screenshot": screenshot,

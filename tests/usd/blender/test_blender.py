@@ -19,7 +19,7 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from usdfab.fabric import preset
-from usdfab.imaging import load_photo
+from usdfab.imaging import read_image
 from usdfab.usd.expand import ExpandOptions, expand
 
 ROOT = Path(__file__).parents[3]
@@ -89,4 +89,4 @@ def test_tints_reach_the_copies(tmp_path):
 
 def read_picture(path: Path) -> np.ndarray:
     """(H, W, 3) linear."""
-    return np.asarray(load_photo(path).pixels)[..., :3]
+    return np.asarray(read_image(path).pixels)[..., :3]
