@@ -278,3 +278,21 @@ def test_options_are_checked(cloth, tmp_path):
         with pytest.raises(UsdfabError, match=message):
             expand(cloth, tmp_path / "f.usdc", options=options)
     assert not (tmp_path / "f.usdc").exists()
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("scale", [1e30, 1e300, 1e-30])
+def test_absurd_texture_coordinates_are_one_error_or_a_file(tmp_path, new_mesh, mode, scale):
+    stage = new_stage(tmp_path / "a.usda")
+    uv = [(u * min(scale, 3e38), v) for u, v in UV]
+    mesh = new_mesh(stage, "/World/Cloth", [*SQUARE, (0.01, 0.03, 0)], [[0, 1, 2, 3], [3, 2, 4]], [*uv, (0.5, 2.0)])
+    bind(stage, mesh)
+    stage.GetPrimAtPath("/World/Looks/Fabric").GetAttribute("usdfab:metersPerUv").Set(0.02)
+    stage.Save()
+    for region in (None, (0.0, 0.0, 0.3, 0.3)):
+        options = replace(OPTIONS, mode=mode, region=region)
+        try:
+            result = expand(tmp_path / "a.usda", tmp_path / "f.usdc", options=options, overwrite=True)
+        except UsdfabError:
+            continue
+        assert result.instances < 10_000

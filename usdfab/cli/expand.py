@@ -45,7 +45,9 @@ def run(
     """Write the cloth of a stage as fibers that any USD program can draw: BasisCurves, instanced or baked.
 
     The new file sublayers the stage, which is not changed. Write .usdc: the arrays are large. Each tile of the fabric
-    is the variant that `usdfab render` shows there.
+    is the variant that `usdfab render` shows there. Where the cloth bends, tiles are divided into pieces down to single
+    crossings of two yarns, until they meet as closely as --tolerance asks; at its borders and seams, pieces whose
+    centre lies on the cloth are kept. Baked curves follow the cloth exactly and are cut where it ends.
 
     Usage examples:
 

@@ -291,12 +291,13 @@ class _Writer:
             u0, v0, u1, v1 = self.options.region
             about = min(about, (u1 - u0) * (v1 - v0) * surface.meters_per_uv**2 / (size[0] * size[1]))
         if self.options.mode == "baked":
-            self._limit(mesh, self.total.points, int(about * copies) * sum(len(c.points) for c in cloth.variants[0]))
+            self._limit(mesh, self.total.points, about * copies * sum(len(c.points) for c in cloth.variants[0]))
         else:
-            self._limit(mesh, self.total.instances, int(about * copies))
+            self._limit(mesh, self.total.instances, about * copies)
 
-    def _limit(self, mesh: Mesh, before: int, more: int) -> None:
-        if before + more > self.options.most:
+    def _limit(self, mesh: Mesh, before: int, more: float) -> None:
+        # Also for NaN.
+        if not before + more <= self.options.most:
             what = "control points" if self.options.mode == "baked" else "copies of the patch"
             raise UsdfabError(
                 f"about {before + more:.3g} {what} are needed, above {self.options.most:g}",

@@ -117,7 +117,7 @@ def place_pieces(
             used = frames
             if shear_steps is not None:
                 used = Frames(frames.centers, poses(frames, np.full(len(here), shear_steps[number])).linear)
-            error = _error(used, corners, there.normals, center.points, (high - low)[here], thickness, tolerance)
+            error = _error(used, corners, there.normals, center.points, (high - low)[here], thickness)
             around = tint(there.uv, there.tint).reshape(-1, 4, 3)
             change = np.abs(around - colors[:, None]).max(axis=(1, 2))
             divided = good & ((error > tolerance) | (change > MAX_TINT_CHANGE))
@@ -138,9 +138,7 @@ def place_pieces(
     return Pieces.joined(found)
 
 
-def _error(
-    frames: Frames, corners: Floats, normals: Floats, center: Floats, size: Floats, thickness: float, tolerance: float
-) -> Floats:
+def _error(frames: Frames, corners: Floats, normals: Floats, center: Floats, size: Floats, thickness: float) -> Floats:
     """(N,) metres: how far frames are from the surface.
 
     At the corners; at the centre, where a quarter counts (nothing opens there); and by how much the cloth's faces open

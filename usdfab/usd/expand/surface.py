@@ -21,6 +21,9 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _CHUNK = 2_000_000
+_FARTHEST = 1e6
+"""Places of the cloth farther out than this, metres, are no sensible texture coordinates and are left out."""
+
 _SLACK = 1e-9
 """How far outside, as a share of a triangle, a point still counts as inside it."""
 
@@ -74,7 +77,8 @@ class ClothSurface:
         area = np.linalg.norm(cross, axis=1)
         size = np.maximum(np.abs(a).sum(axis=1), np.abs(b).sum(axis=1))
         # Triangles that cover no cloth, or of which no surface is left, carry no fibers.
-        keep = faces & (np.abs(determinant) > 1e-12 * size**2) & (area > 0.0)
+        near = np.abs(xy).max(axis=(1, 2), initial=0.0) < _FARTHEST
+        keep = faces & near & (np.abs(determinant) > 1e-12 * size**2) & (area > 0.0)
         self.xy, self.points, self.uv = xy[keep], points[keep], mesh.uv[keep]
         self.albedo = None if mesh.albedo is None else mesh.albedo[keep]
         a, b, determinant = a[keep], b[keep], determinant[keep]
@@ -197,7 +201,9 @@ class _Grid:
         low, high = xy.min(axis=1), xy.max(axis=1)
         box = (high - low).prod(axis=1)
         # Half a box: fewer triangles that do not hold the place, for twice the memory.
-        self.side = 0.5 * float(np.sqrt(box.mean())) if len(xy) else 1.0
+        # Slivers must not fill it.
+        longest = (high - low).max(axis=1, initial=0.0)
+        self.side = max(0.5 * float(np.sqrt(box.mean())), float(longest.mean()) / 16.0) if len(xy) else 1.0
         self.origin = low.min(axis=0) if len(xy) else np.zeros(2)
         first, last = self._cell(low), self._cell(high)
         self.shape = last.max(axis=0) + 1 if len(xy) else np.ones(2, dtype=np.int64)
