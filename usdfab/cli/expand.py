@@ -59,6 +59,7 @@ def run(
     stage:
         A USD file with cloth meshes; those without texture coordinates are unwrapped.
     """
+    from usdfab.errors import UsdfabError
     from usdfab.files import checked_output
     from usdfab.imaging.image_output import OUTPUT_SUFFIXES
     from usdfab.tracer.texture_reader import TextureReader
@@ -74,6 +75,8 @@ def run(
         limit=max_instances,
     )
     width, height = parse_resolution(resolution)
+    if screenshot is not None and mode == "baked":
+        raise UsdfabError("baked curves have no seams to draw", place="--screenshot", remedy="use another mode")
     if screenshot is not None:
         checked_output(screenshot, OUTPUT_SUFFIXES, overwrite=overwrite, kind="images")
     result = expand(
