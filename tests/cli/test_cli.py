@@ -183,7 +183,25 @@ def test_expand_writes_instanced_curves(small: Path, tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
-    assert result["instances"] > 100 and result["prototype_curves"] == 48
+    assert result["instances"] > 100 and result["prototype_curves"] > 0 and result["mode"] == "instancer"
+    seams = result["seams"]
+    assert 0 < seams["median"] <= seams["p99"] <= seams["largest"] and seams["p99"] < seams["yarn_width"]
+
+
+def test_expand_bakes_a_region_and_draws_seams(small: Path, tmp_path: Path) -> None:
+    out, picture = tmp_path / "fibers.usdc", tmp_path / "seams.png"
+    cloth = (SAMPLES / "drape.usda", "--fabric", small, "-o", out, "--region", "0.45,0.45,0.47,0.47")
+    done = usdfab("expand", *cloth, "--mode", "baked", "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["instances"] == 0 and result["prototype_points"] > 1000 and result["seams"] is None
+    done = usdfab("expand", *cloth, "--mode", "xform", "--overwrite", "--screenshot", picture, "--resolution", "80x60")
+    if done.returncode == 2 and "VTK finds no OpenGL" in done.stderr:
+        pytest.skip(done.stderr.strip())
+    assert done.returncode == 0 and "pieces meet" in done.stderr, done.stderr
+    assert len(np.unique(read_image(picture).pixels.reshape(-1, 3), axis=0)) > 50
+    done = usdfab("expand", *cloth)
+    assert done.returncode == 2 and "exists" in done.stderr and len(done.stderr.strip().splitlines()) == 1
 
 
 def test_inspect_draws_a_picture_without_a_display(small: Path, tmp_path: Path) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import json
 import logging
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +14,14 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, YarnParameters, preset
 from usdfab.fibers import generate_patch
+from usdfab.fibers.tiles import tile_copies
 from usdfab.usd.check import check
-from usdfab.usd.expand import expand
+from usdfab.usd.expand import ExpandOptions, expand
 from usdfab.usd.fabric_io import define_fabric_material, read_fabric
-from usdfab.usd.placement import estimate, place
 
 PATCHES = "/World/Cloth_fibers/Patches"
 FEW = {"fiber_count": 5}
+FEW_POINTS = ExpandOptions(vertices_per_segment=6, overlap=0.0)
 
 
 @pytest.fixture
@@ -79,13 +80,14 @@ def world_transforms(stage, path=PATCHES):
 
 def test_what_is_written(cloth, tmp_path, small):
     before = cloth.read_bytes()
-    result = expand(cloth, tmp_path / "fibers.usda", vertices_per_segment=6)
+    result = expand(cloth, tmp_path / "fibers.usda", options=FEW_POINTS)
     assert cloth.read_bytes() == before
-    assert result.instances == 10 * 20
+    assert result.instances == 5 * 10 and result.prototypes == 4
+    assert result.seams is not None and result.seams.largest < 1e-9
     assert result.meshes == ("/World/Cloth",) and result.warnings == ()
     stage = Usd.Stage.Open(str(result.path))
     layer = stage.GetRootLayer()
-    assert list(layer.subLayerPaths) == ["cloth.usda"]
+    assert list(layer.subLayerPaths) == ["./cloth.usda"]
     assert UsdGeom.GetStageMetersPerUnit(stage) == 0.01 and UsdGeom.GetStageUpAxis(stage) == "Y"
     assert stage.GetDefaultPrim().GetPath() == "/World"
     assert not layer.GetAttributeAtPath("/World/Cloth.points")
@@ -93,9 +95,9 @@ def test_what_is_written(cloth, tmp_path, small):
     assert mesh.ComputeVisibility() == "invisible"
     prototypes = stage.GetPrimAtPath(f"{PATCHES}/Prototypes")
     assert prototypes.GetSpecifier() == Sdf.SpecifierOver and not prototypes.IsDefined()
-    curves = {c.GetName(): UsdGeom.BasisCurves(c) for c in prototypes.GetChild("Patch").GetAllChildren()}
-    assert set(curves) == {"Warp", "Weft_0", "Weft_1"}
-    assert sum(len(c.GetCurveVertexCountsAttr().Get()) for c in curves.values()) == result.curves == 20
+    curves = {c.GetName(): UsdGeom.BasisCurves(c) for c in prototypes.GetChild("Variant0").GetAllChildren()}
+    assert set(curves) == {"Warp", "Weft"}
+    assert sum(len(c.GetCurveVertexCountsAttr().Get()) for c in curves.values()) == result.curves / 4 == 40
     for name, c in curves.items():
         assert (c.GetTypeAttr().Get(), c.GetBasisAttr().Get(), c.GetWrapAttr().Get()) == (
             "cubic",
@@ -114,13 +116,20 @@ def test_what_is_written(cloth, tmp_path, small):
         api = UsdGeom.PrimvarsAPI(c)
         assert api.GetPrimvar("usdfab:yarn").GetInterpolation() == "uniform"
         assert len(api.GetPrimvar("usdfab:fiber").Get()) == len(c.GetCurveVertexCountsAttr().Get())
-    np.testing.assert_allclose(curves["Weft_0"].GetDisplayColorAttr().Get(), [(0, 0, 1)])
-    np.testing.assert_allclose(curves["Weft_1"].GetDisplayColorAttr().Get(), [(1, 0, 0)])
+        assert json.loads(c.GetPrim().GetAttribute("userProperties:usdfab").Get())["system"] == name.lower()
+    assert curves["Warp"].GetDisplayColorPrimvar().GetInterpolation() == "constant"
+    colors = curves["Weft"].GetDisplayColorPrimvar()
+    assert colors.GetInterpolation() == "uniform"
+    yarn = np.asarray(UsdGeom.PrimvarsAPI(curves["Weft"]).GetPrimvar("usdfab:yarn").Get())
+    np.testing.assert_allclose(np.asarray(colors.Get())[yarn % 2 == 0], np.broadcast_to((1, 0, 0), (10, 3)))
+    np.testing.assert_allclose(np.asarray(colors.Get())[yarn % 2 == 1], np.broadcast_to((0, 0, 1), (10, 3)))
+    root = UsdGeom.Imageable(stage.GetPrimAtPath("/World/Cloth_fibers"))
+    assert Usd.ModelAPI(root).GetKind() == "subcomponent" and root.GetPurposeAttr().Get() == "default"
 
 
 @pytest.mark.parametrize("suffix", [".usda", ".usdc"])
 def test_the_file_is_clean(cloth, tmp_path, suffix):
-    path = expand(cloth, tmp_path / f"fibers{suffix}", vertices_per_segment=6).path
+    path = expand(cloth, tmp_path / f"fibers{suffix}", options=FEW_POINTS).path
     assert {issue.rule for issue in check(path)} <= {"usdfab:fiberRadius", "usdfab:unusual"}  # few, thick fibers
     if suffix == ".usda":
         return  # NVIDIA's checker wants large arrays in .usdc, and is right
@@ -133,7 +142,7 @@ def test_the_file_is_clean(cloth, tmp_path, suffix):
 
 
 def test_extent_holds_all_fibers(cloth, tmp_path):
-    stage = Usd.Stage.Open(str(expand(cloth, tmp_path / "f.usda", vertices_per_segment=6).path))
+    stage = Usd.Stage.Open(str(expand(cloth, tmp_path / "f.usda", options=FEW_POINTS).path))
     _, instancer = world_transforms(stage)
     low, high = np.array(instancer.GetExtentAttr().Get())
     size = high - low
@@ -145,18 +154,20 @@ def test_extent_holds_all_fibers(cloth, tmp_path):
 
 
 def test_copies_lie_on_the_cloth_and_join(cloth, tmp_path):
-    stage = Usd.Stage.Open(str(expand(cloth, tmp_path / "f.usda", vertices_per_segment=6).path))
+    stage = Usd.Stage.Open(str(expand(cloth, tmp_path / "f.usda", options=FEW_POINTS).path))
     transforms, _ = world_transforms(stage)
-    assert len(transforms) == 200
+    assert len(transforms) == 50
     # Where the cells should be: the mesh's own transform of uv, in the stage's centimetres.
     world = np.array(UsdGeom.Xformable(stage.GetPrimAtPath("/World/Cloth")).ComputeLocalToWorldTransform(0)).T
-    columns, rows = np.meshgrid(np.arange(10), np.arange(20))
-    u, v = (columns.ravel() + 0.5) * 0.1, (rows.ravel() + 0.5) * 0.05
+    columns, rows = np.meshgrid(np.arange(5), np.arange(10))
+    u, v = (columns.ravel() + 0.5) * 0.2, (rows.ravel() + 0.5) * 0.1
     expected = np.column_stack([u / 2, v / 3, 0 * u, 0 * u + 1]) @ world.T
-    np.testing.assert_allclose(transforms[:, :3, 3], expected[:, :3], atol=1e-5)
+    order = np.argmin(np.linalg.norm(expected[:, None, :3] - transforms[None, :, :3, 3], axis=2), axis=1)
+    assert sorted(order) == list(range(50))
+    np.testing.assert_allclose(transforms[order, :3, 3], expected[:, :3], atol=1e-5)
     # The cloth is as large as its uv in every direction, so that copies are neither stretched nor turned.
     linear = world[:3, :3] / [2, 3, 4]
-    np.testing.assert_allclose(transforms[:, :3, :3], np.broadcast_to(linear, (200, 3, 3)), atol=2e-3)
+    np.testing.assert_allclose(transforms[:, :3, :3], np.broadcast_to(linear, (50, 3, 3)), atol=2e-3)
 
 
 def spline_ends(points, counts):
@@ -169,9 +180,9 @@ def spline_ends(points, counts):
 
 
 def test_fibers_end_where_their_continuations_begin(cloth, tmp_path, small):
-    stage = Usd.Stage.Open(str(expand(cloth, tmp_path / "f.usda", vertices_per_segment=6).path))
-    patch = generate_patch(small, 6)
-    curves = UsdGeom.BasisCurves(stage.GetPrimAtPath(f"{PATCHES}/Prototypes/Patch/Warp"))
+    stage = Usd.Stage.Open(str(expand(cloth, tmp_path / "f.usda", options=FEW_POINTS).path))
+    patch = generate_patch(small, 6, tile_copies(small))
+    curves = UsdGeom.BasisCurves(stage.GetPrimAtPath(f"{PATCHES}/Prototypes/Variant0/Warp"))
     points = np.asarray(curves.GetPointsAttr().Get(), dtype=float) * 0.01
     first, last = spline_ends(points, curves.GetCurveVertexCountsAttr().Get())
     np.testing.assert_allclose(last, first[patch.warp.successor] + patch.warp.period, atol=1e-9)
@@ -182,13 +193,13 @@ def test_fibers_end_where_their_continuations_begin(cloth, tmp_path, small):
 def test_flyaways_are_curves_of_their_own(cloth, tmp_path, small):
     hairy = {"flyaway_density": 5000.0, "flyaway_length": 8e-4, "ply_count": 2}
     fabric = replace(small, warp=replace(small.warp, **hairy), weft=replace(small.weft, **hairy))
-    path = expand(cloth, tmp_path / "f.usda", fabric, vertices_per_segment=6).path
+    path = expand(cloth, tmp_path / "f.usda", fabric, FEW_POINTS).path
     stage = Usd.Stage.Open(str(path))
     assert {issue.rule for issue in check(path)} <= {"usdfab:fiberRadius", "usdfab:unusual"}  # few, thick fibers
-    names = [c.GetName() for c in stage.GetPrimAtPath(f"{PATCHES}/Prototypes/Patch").GetAllChildren()]
-    assert names == ["Warp", "Weft_0", "Weft_1", "WarpFlyaways", "WeftFlyaways_0", "WeftFlyaways_1"]
-    patch = generate_patch(fabric, 6)
-    curves = UsdGeom.BasisCurves(stage.GetPrimAtPath(f"{PATCHES}/Prototypes/Patch/WarpFlyaways"))
+    names = [c.GetName() for c in stage.GetPrimAtPath(f"{PATCHES}/Prototypes/Variant0").GetAllChildren()]
+    assert names == ["Warp", "Weft", "WarpFlyaways", "WeftFlyaways"]
+    patch = generate_patch(fabric, 6, tile_copies(fabric))
+    curves = UsdGeom.BasisCurves(stage.GetPrimAtPath(f"{PATCHES}/Prototypes/Variant0/WarpFlyaways"))
     warp = patch.flyaways[0]
     counts = np.asarray(curves.GetCurveVertexCountsAttr().Get())
     np.testing.assert_array_equal(counts, np.diff(warp.offsets) + 2)
@@ -204,80 +215,18 @@ def test_flyaways_are_curves_of_their_own(cloth, tmp_path, small):
     assert np.isfinite(np.array(instancer.GetExtentAttr().Get())).all()
 
 
-def corners(points, faces):
-    """Triangles of quads as (T, 3, ...) arrays."""
-    f = np.asarray(faces)
-    return np.asarray(points)[np.concatenate([f[:, [0, 1, 2]], f[:, [0, 2, 3]]])]
-
-
-@pytest.mark.parametrize("n", [1, 2, 5, 8, 10, 20])
-def test_each_cell_is_placed_once_whatever_the_mesh(n):
-    # With 10 x 10 cells on grids of n x n quads, centres fall on edges, diagonals and corners of triangles.
-    points, faces = grid(n, 1.0)
-    p = corners(points, faces)
-    placed = place(p, p[..., :2], None, (0.1, 0.1), 1.0)
-    assert len(placed.cells) == 100
-    assert len(np.unique(placed.cells, axis=0)) == 100
-    np.testing.assert_allclose(placed.positions[:, :2], (placed.cells + 0.5) * 0.1, atol=1e-12)
-    assert estimate(p[..., :2], (0.1, 0.1)) == pytest.approx(100)
-
-
-def test_turned_grids_place_each_cell_once():
-    points, faces = grid(7, 1.0)
-    p = corners(points, faces)
-    turn = np.array([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]])
-    placed = place(p, p[..., :2] @ turn.T, None, (0.02, 0.03), 1.0)
-    assert len(np.unique(placed.cells, axis=0)) == len(placed.cells)
-    assert len(placed.cells) == pytest.approx(1 / 0.0006, rel=0.02)
-    # the weft runs along +u
-    np.testing.assert_allclose(placed.rotations[0][:, 0], [math.cos(0.3), -math.sin(0.3), 0], atol=1e-12)
-
-
-def test_frames_on_a_cylinder():
-    n, radius = 200, 0.5
-    angle = np.linspace(0, math.pi, n + 1)
-    points = [(radius * math.cos(a), radius * math.sin(a), z) for z in (0.0, 1.0) for a in angle]
-    uv = [(radius * a, z) for z in (0.0, 1.0) for a in angle]
-    faces = [[i, i + 1, n + 2 + i, n + 1 + i] for i in range(n)]
-    p = corners(points, faces)
-    normals = p * [1, 1, 0] / np.linalg.norm(p * [1, 1, 0], axis=2, keepdims=True)
-    placed = place(p, corners(uv, faces), normals, (0.05, 0.05), 1.0)
-    assert len(placed.positions) == pytest.approx(0.5 * math.pi / 0.0025, rel=0.02)
-    a = (placed.cells[:, 0] + 0.5) * 0.05 / radius
-    zero = 0 * a
-    expected = np.stack([np.stack([-np.sin(a), np.cos(a), zero], 1), np.stack([zero, zero, zero + 1], 1),
-                         np.stack([np.cos(a), np.sin(a), zero], 1)], axis=2)  # fmt: skip
-    np.testing.assert_allclose(placed.rotations, expected, atol=0.01)
-    np.testing.assert_allclose(placed.scales, 1, atol=1e-3)
-    np.testing.assert_allclose(np.linalg.det(placed.rotations), 1)
-
-
-def test_mirrored_and_stretched_uv():
-    points, faces = grid(2, 1.0)
-    p = corners(points, faces)
-    mirrored = place(p, p[..., :2] * [-1, 1], None, (0.25, 0.25), 1.0)
-    np.testing.assert_allclose(mirrored.rotations[0][:, 0], [-1, 0, 0])
-    np.testing.assert_allclose(mirrored.rotations[0][:, 2], [0, 0, 1])
-    np.testing.assert_allclose(np.linalg.det(mirrored.rotations), 1)
-    np.testing.assert_allclose(mirrored.scales, np.broadcast_to([1, -1, 1], (16, 3)))
-    # rotation times scale is the affine map of the uv, front to the front: dp/du, dp/dv
-    stretched = place(p, p[..., :2] * [0.5, 2], None, (0.25, 0.25), 1.0)
-    np.testing.assert_allclose(stretched.scales, np.broadcast_to([2, 0.5, 1], (16, 3)))
-    assert len(stretched.positions) == 16
-
-
 # --- options and errors ----------------------------------------------------------------------------------------------
 
 
 def test_region(cloth, tmp_path):
-    assert expand(cloth, tmp_path / "f.usda", region=(0, 0, 0.5, 0.25), vertices_per_segment=6).instances == 25
+    assert expand(cloth, tmp_path / "f.usda", options=replace(FEW_POINTS, region=(0, 0, 0.6, 0.3))).instances == 3 * 3
 
 
 def test_a_given_fabric_brings_its_material(cloth, tmp_path):
     denim = replace(preset("denim"), size=(4e-3, 4e-3))
-    path = expand(cloth, tmp_path / "f.usda", denim, vertices_per_segment=4).path
+    path = expand(cloth, tmp_path / "f.usda", denim, replace(FEW_POINTS, vertices_per_segment=4)).path
     stage = Usd.Stage.Open(str(path))
-    curves = stage.GetPrimAtPath(f"{PATCHES}/Prototypes/Patch/Warp")
+    curves = stage.GetPrimAtPath(f"{PATCHES}/Prototypes/Variant0/Warp")
     bound = UsdShade.MaterialBindingAPI(curves).ComputeBoundMaterial()[0]
     assert read_fabric(stage, bound.GetPath()) == denim
     assert {issue.rule for issue in check(path)} <= {"usdfab:fiberRadius", "usdfab:unusual"}  # few, thick fibers
@@ -292,20 +241,20 @@ def test_what_cannot_be_hidden_is_said(cloth, tmp_path):
     UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(grey)
     UsdLux.GeometryLight.Define(stage, "/World/Lamp")
     stage.Save()
-    result = expand(cloth, tmp_path / "f.usda", vertices_per_segment=6)
+    result = expand(cloth, tmp_path / "f.usda", options=FEW_POINTS)
     text = "\n".join(result.warnings)
     assert "only some faces are cloth" in text and "GeometryLight" in text
-    assert 0 < result.instances < 200
+    assert 0 < result.instances < 50 * 16
 
 
 def test_errors(cloth, tmp_path, new_mesh):
     out = tmp_path / "f.usda"
-    with pytest.raises(UsdfabError, match=r"about 200 copies .* above 100"):
-        expand(cloth, out, max_instances=100)
+    with pytest.raises(UsdfabError, match=r"about 50 copies .* above 40"):
+        expand(cloth, out, options=ExpandOptions(limit=40))
     with pytest.raises(UsdfabError, match=r"</World/Nope>: there is no mesh with a fabric"):
         expand(cloth, out, prim="/World/Nope")
     with pytest.raises(UsdfabError, match="no patch cell has its centre on the cloth"):
-        expand(cloth, out, region=(5, 5, 6, 6))
+        expand(cloth, out, options=ExpandOptions(region=(5, 5, 6, 6)))
     with pytest.raises(UsdfabError, match="the file to write is the file to read"):
         expand(cloth, cloth, overwrite=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cloth.usda"]

@@ -16,19 +16,14 @@ from numpy.typing import NDArray
 
 from usdfab.fabric import FabricParameters, YarnParameters
 from usdfab.fibers import FiberSystem, OpenCurves, Patch, generate_patch, patch_variants
+from usdfab.fibers.tiles import tile_copies
 from usdfab.scattering.fiber_numba import pack_fiber
 from usdfab.scattering.roughness import absorption_from_albedo
 from usdfab.tracer.embree import NEIGHBOR_LEFT, NEIGHBOR_RIGHT, EmbreeScene, curve_scene
 
-TILE_CELLS = 4
-"""A tile has at least this many cells on each side: rays cross its border less often, and repetition shows less."""
-
 FIBER_RADIUS_UNITS = 0.1
 """Radius of the thinnest fiber in patch space. Embree's curve intersector has thresholds that are not relative: in
 metres, with fibers of 1e-5, it returns wrong places along the segment."""
-
-MAX_TILE_SEGMENTS = 1_500_000
-"""Beyond this a tile stays at one repeat of the weave."""
 
 BEND = 0.03
 """How far, in fiber radii, a straight segment may be from the spline: knots in between are left out. The shading frame
@@ -120,17 +115,6 @@ def pack_segments(start: NDArray, end: NDArray, curve: NDArray) -> NDArray[np.in
     """
     tangents = np.rint(32767.0 * np.c_[start, end]).astype(np.int16)
     return np.c_[tangents, np.asarray(curve, dtype="<u4").view("<i2").reshape(-1, 2)]
-
-
-def tile_copies(fabric: FabricParameters) -> tuple[int, int]:
-    """Repeats of the weave along x and y that make up one tile."""
-    picks, ends = fabric.repeat()
-    copies = max(1, -(-TILE_CELLS // ends)), max(1, -(-TILE_CELLS // picks))
-    segments = sum(
-        copies[0] * copies[1] * fabric.system(s).fiber_count * 40 * 2 * (ends if s == "warp" else picks)
-        for s in ("warp", "weft")
-    )
-    return copies if segments <= MAX_TILE_SEGMENTS else (1, 1)
 
 
 def _pack(yarn: YarnParameters, color: tuple[float, ...]) -> NDArray[np.float64]:

@@ -30,6 +30,7 @@ def read_scene(
     strict: bool = False,
     placements: bool = True,
     purposes: tuple[str, ...] = PURPOSES,
+    by_path: bool = False,
 ) -> Scene:
     """What a renderer needs of a stage.
 
@@ -56,6 +57,8 @@ def read_scene(
     placements:
         Whether copies may be ``Mesh.placements``. If not, native instances are meshes of their own, and point
         instancers are left out with a warning.
+    by_path:
+        Native instances are meshes of their own also where ``placements`` allows to share them: each has its path.
     purposes:
         ``default``, ``render``, ``proxy``, ``guide``.
 
@@ -79,7 +82,7 @@ def read_scene(
     collector.collect()
     cameras = _chosen_first(stage, collector.cameras, camera, meters, frame, problems)
     lights = _lights(collector.lights, meters, frame, problems)
-    resolver = Resolver(stage, span, problems, share=placements, subdivision=subdivision)
+    resolver = Resolver(stage, span, problems, share=placements, by_path=by_path, subdivision=subdivision)
     meshes = resolver.resolve(collector.meshes, fabric_override)
     if not meshes:
         raise _nothing(stage, problems)

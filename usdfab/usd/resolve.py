@@ -61,10 +61,17 @@ class Resolver:
     """Makes meshes of placed prims; collects ``materials`` and ``fabrics`` on the way."""
 
     def __init__(
-        self, stage: Usd.Stage, shutter: Shutter, problems: Problems, *, share: bool, subdivision: int | None
+        self,
+        stage: Usd.Stage,
+        shutter: Shutter,
+        problems: Problems,
+        *,
+        share: bool,
+        subdivision: int | None,
+        by_path: bool = False,
     ) -> None:
         self.stage, self.shutter, self.problems = stage, shutter, problems
-        self.share, self.subdivision = share, subdivision
+        self.share, self.subdivision, self.by_path = share, subdivision, by_path
         self.meters = UsdGeom.GetStageMetersPerUnit(stage)
         self.materials: list[Material] = []
         self.fabrics: list[FabricSurface] = []
@@ -137,8 +144,10 @@ class Resolver:
         closed[:, :3, 3] *= self.meters
         close = closed if closes else None
         groups = []
-        for sign in (False, True):
-            mine = np.flatnonzero((determinant[0, regular] < 0) == sign)
+        mirrored = determinant[0, regular] < 0
+        apart = np.unique([str(p.GetPath()) for p in prims], return_inverse=True)[1] if self.by_path else 0 * mirrored
+        for key in np.unique(2 * apart + mirrored):
+            mine = np.flatnonzero(2 * apart + mirrored == key)
             if self.share and len(mine) >= SHARED:
                 groups.append((mine[0], mine))
             else:
