@@ -84,6 +84,14 @@ def _run(arguments: list[str]) -> int:
     except CycloptsError as error:
         print(f"usdfab: {' '.join(str(error).split())}; see usdfab --help", file=sys.stderr)
         return USAGE_ERROR
+    except RuntimeError as error:
+        # Values of a damaged .usdc are unpacked, and found to be damaged, wherever they are first looked at.
+        if not type(error).__module__.startswith("pxr."):
+            raise
+        from usdfab.usd.stage import usd_reason
+
+        print(f"usdfab: USD cannot read a file ({usd_reason(error)})", file=sys.stderr)
+        return USAGE_ERROR
     except KeyboardInterrupt:
         print("usdfab: interrupted", file=sys.stderr)
         return INTERRUPTED

@@ -41,7 +41,7 @@ from usdfab.usd.fabric_io import (
     write_fabric,
 )
 from usdfab.usd.schema_source import FABRIC_ATTRIBUTES, YARN_ATTRIBUTES, fabric_attribute_name, yarn_attribute_name
-from usdfab.usd.stage import open_stage, site, stage_name
+from usdfab.usd.stage import open_stage, readable, site, stage_name
 
 Change = Callable[[FabricParameters], FabricParameters]
 
@@ -129,7 +129,8 @@ def change_fabric(
 def _copy(source: Sdf.Layer, out: Path) -> Sdf.Layer:
     """A copy in memory whose relative paths are right for a file at ``out``."""
     layer = Sdf.Layer.CreateAnonymous(out.suffix.lower())
-    layer.TransferContent(source)
+    with readable(source.realPath or source.identifier):
+        layer.TransferContent(source)
     folder = out.parent
     if source.anonymous or folder.resolve() == Path(source.realPath).parent.resolve():
         return layer

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,15 +44,25 @@ def open_stage(source: str | Path | Usd.Stage) -> Usd.Stage:
         raise UsdfabError("this is not a USD file", place=str(path), remedy="USD files are .usda, .usdc, .usd, .usdz")
     if not os.access(path, os.R_OK):
         raise UsdfabError("the file is not readable", place=str(path), remedy="change its permissions")
-    try:
+    with readable(path):
         return Usd.Stage.Open(str(path))
+
+
+@contextmanager
+def readable(path: str | Path) -> Iterator[None]:
+    """Turns what USD raises about a file's contents, at once or when it looks at a value, into ``UsdfabError``."""
+    try:
+        yield
     except Tf.ErrorException as error:
-        raise UsdfabError(f"USD cannot read the file ({_reason(error)})", place=str(path)) from error
+        raise UsdfabError(f"USD cannot read the file ({usd_reason(error)})", place=str(path)) from error
 
 
-def _reason(error: Tf.ErrorException) -> str:
+def usd_reason(error: RuntimeError) -> str:
     """What went wrong first, without the place in USD's sources: ``'message'`` at the end of each line."""
-    text = str(error)
+    try:
+        text = str(error)
+    except UnicodeDecodeError:  # USD quotes what it found, whatever bytes they are
+        return "it holds bytes that are no text"
     messages = [m.strip() for m in re.findall(r" : '(.*?)'\s*(?=\n\s*Error in|\Z)", text, flags=re.DOTALL)]
     said = [m for m in messages if not m.startswith("Failed to open layer")] or messages or [text]
     return " ".join(said[0].split()) or "unreadable"
