@@ -33,6 +33,7 @@ COMMANDS = {
     "merge": "Join the parts of a picture that render --tile wrote.",
     "inspect": "Look at the fibers of a fabric, in a window or as a picture.",
     "expand": "Write the cloth of a stage as instanced fibers for any USD program.",
+    "export": "Bake a fabric into maps for any program: USD layer, MaterialX, USDZ, U3M.",
     "new": "Write a new fabric from a preset or a weave.",
     "edit": "Change parameters of a fabric.",
     "info": "Print the fabrics of a file with all parameters.",
