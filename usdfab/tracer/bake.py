@@ -67,6 +67,8 @@ MAX_DEPTH = 512
 """Longest path: white fibers in white cloth go on for long, and roulette ends the others."""
 FILTER_RADIUS = 8
 """Half the window, in texels, in which reflectance is a linear function of the other maps."""
+AO_RADIUS = 2
+"""The same for the ambient occlusion."""
 _ROWS = 16
 
 
@@ -260,9 +262,11 @@ class _Packed:
         # Seen from above no visible normal points down, so that a mean does not either; that is up to rounding.
         normal[..., 2] = np.maximum(normal[..., 2], 1e-3)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-        guides = np.concatenate([color, bent[..., 2:], mean[SKY][..., None], place[..., None]], axis=-1)
+        shape = filled(np.concatenate([color, bent[..., 2:], place[..., None]], axis=-1), hits)
+        # One sky ray for each ray makes grain that the eye sees.
+        sky = np.clip(guided(mean[SKY][..., None], shape[..., 3:], hits, AO_RADIUS), 0.0, 1.0)
+        guides = np.concatenate([shape, sky], axis=-1)
         noisy = layers[..., BACK : BACK + 3] / np.maximum(layers[..., PATHS], 1.0)[..., None]
-        guides = filled(guides, hits)
         reflectance = guided(noisy, guides, layers[..., PATHS], FILTER_RADIUS)
         coverage = float(hits.mean(dtype=np.float64)) / rays
         paths = max(float(through[3]), 1.0)
@@ -279,7 +283,7 @@ class _Packed:
             height=place,
             opacity=hits / np.float32(rays),
             orientation=across,
-            ao=filled(mean[SKY][..., None], hits)[..., 0],
+            ao=sky[..., 0],
             transmittance=transmittance,  # type: ignore[arg-type]
             loose=float(layers[..., LOOSE].sum(dtype=np.float64) / max(hits.sum(dtype=np.float64), 1.0)),
             thickness=high - low,

@@ -17,8 +17,8 @@ def guided(noisy: Map, guides: Map, weight: Map, radius: int) -> Map:
     """``noisy`` without most of its noise: locally a linear function of the guides (He, Sun and Tang 2013).
 
     In each square window a weighted linear regression of ``noisy`` on the guides; a texel gets the mean of the
-    predictions of all windows that hold it. The weighted mean over the whole map stays what it was, since residuals of
-    each regression sum to 0 and windows wrap around.
+    predictions of all windows that hold it. Where all weights are equal the mean over the whole map stays what it was,
+    since the residuals of each regression sum to 0 and windows wrap around.
 
     Parameters
     ----------
