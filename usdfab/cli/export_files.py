@@ -114,6 +114,7 @@ def export(source: Path, output: Path, options: ExportOptions, progress: Callabl
 
 def _check_outputs(source: Path, output: Path, fabric: FabricParameters, options: ExportOptions) -> None:
     over = options.overwrite
+    cloth_scale(source, options.prim, options.meters_per_uv)
     if options.kind == "usdz":
         checked_usdz(output, overwrite=over)
     elif options.kind == "u3ma":
@@ -125,7 +126,9 @@ def _check_outputs(source: Path, output: Path, fabric: FabricParameters, options
             place = str(output.parent)
             raise UsdfabError("the folder does not exist", place=place, remedy=f"create {place} first")
         main = f"{file_name(fabric.name)}.u3m" if options.kind == "u3m" else _look_name(source)
-        for file in (output / main, output / PREVIEW):
+        files = [output / main, output / PREVIEW]
+        files += [output / MAPS_FOLDER / f"{name}.{options.format}" for name in options.maps if options.kind == "folder"]
+        for file in files:
             if file.exists() and not over:
                 raise UsdfabError("the file exists", place=str(file), remedy="choose another name or use --overwrite")
     if options.screenshot is not None:

@@ -168,7 +168,7 @@ def bake(
     check_segments(fabric, settings.repeats)
     size = (fabric.cell[0] * ends * settings.repeats[0], fabric.cell[1] * picks * settings.repeats[1])
     width, height = map_resolution(settings.resolution, size)
-    rays = settings.rays or int(np.clip(RAYS // (width * height), 16, 256))
+    rays = int(np.clip(RAYS // (width * height), 16, 256)) if settings.rays is None else settings.rays
     if not 1 <= rays <= 2**16:
         raise UsdfabError(f"{rays} rays for each texel", place="rays", remedy="use 1 to 65536")
     patch = generate_patch(fabric, copies=settings.repeats)

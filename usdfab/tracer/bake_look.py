@@ -28,7 +28,7 @@ from usdfab.usd.rig import rig_for, swatch_scene
 from usdfab.usd.scene import PointLight
 
 COARSE, FINE = (1024, 32), (8192, 128)
-"""Texels that stand for all, and directions that stand for the sky: while searching, and in the end."""
+"""Places that stand for all, and directions that stand for the sky: while searching, and in the end."""
 F0_TRIED = (0.015, 0.025, 0.035, 0.0465, 0.06, 0.08)
 """Reflectances at normal incidence that are tried: indices of refraction from 1.28 to 1.8; 1.55 is a fiber's."""
 ROUGHNESS_TRIED = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -126,14 +126,19 @@ def fit_look(fabric: FabricParameters, maps: BakedMaps, *, threads: int | None =
 class _Fit:
     """Brightness of a surface with the maps, for any reflection, over the fibers' under sky and lamp."""
 
-    def __init__(self, maps: BakedMaps, targets: tuple[NDArray, NDArray], texels: int, directions: int) -> None:
-        chosen = _some(maps.opacity.size, texels)
+    def __init__(self, maps: BakedMaps, targets: tuple[NDArray, NDArray], places: int, directions: int) -> None:
+        rows, columns, fx, fy = _places(maps.opacity.shape, places)
 
         def pick(layer: Map) -> NDArray[np.float64]:
-            return layer.reshape(-1, *layer.shape[2:])[chosen].astype(np.float64)
+            """Between texels, as viewers look maps up: that makes normals lean less."""
+            values = layer.astype(np.float64).reshape(*layer.shape[:2], -1)
+            below, right = (rows + 1) % layer.shape[0], (columns + 1) % layer.shape[1]
+            upper = values[rows, columns] * (1.0 - fx) + values[rows, right] * fx
+            lower = values[below, columns] * (1.0 - fx) + values[below, right] * fx
+            return (upper * (1.0 - fy) + lower * fy).reshape(-1, *layer.shape[2:])
 
         self._roughness, self._normals, weights = pick(maps.roughness), pick(maps.normal), pick(maps.opacity)
-        # The chosen texels stand for all: their means are to be the map's.
+        # The chosen places stand for all: their means are to be the map's.
         self._weights = weights * (maps.opacity.mean(dtype=np.float64) / max(weights.sum(), 1e-9))
         albedo = pick(maps.reflectance)
         mean = (albedo * self._weights[:, None]).sum(axis=0)
@@ -213,8 +218,9 @@ def _lamp_lights() -> tuple[NDArray, NDArray]:
     return directions, np.full(4, math.pi / directions[0, 2] / 4)
 
 
-def _some(count: int, most: int) -> NDArray[np.int64]:
-    """Indices of at most ``most`` of ``count`` texels, evenly strewn."""
-    if count <= most:
-        return np.arange(count)
-    return np.floor((np.arange(most) * 0.6180339887498949 % 1.0) * count).astype(np.int64)
+def _places(shape: tuple[int, ...], count: int) -> tuple[NDArray[np.int64], ...]:
+    """Rows and columns (N,) of places strewn evenly over a map, and (N, 1) how far on to the next texel they are."""
+    k = np.arange(count)
+    x, y = (0.7548776662466927 * k) % 1.0 * shape[1], (0.5698402909980532 * k) % 1.0 * shape[0]
+    columns, rows = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    return rows, columns, (x - columns)[:, None], (y - rows)[:, None]
