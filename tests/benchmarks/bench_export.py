@@ -83,7 +83,9 @@ def views(fabric: FabricParameters) -> Iterator[tuple[str, Scene, Camera]]:
     camera = scene.cameras[0]
     yield "rig", scene, camera
     yield "sky", replace(scene, lights=(sky(),)), camera
-    yield "sun 45", replace(scene, lights=(sun(45, 30),)), camera
+    yield "sun 45, from 30", replace(scene, lights=(sun(45, 30),)), camera
+    around = tuple(replace(s, irradiance=s.irradiance / 8) for s in (sun(45, 45 * k) for k in range(8)))
+    yield "sun 45, mean", replace(scene, lights=around), camera
     yield "sky, seen at 60", replace(scene, lights=(sky(),)), tilted(camera, 60)
     yield "all around", replace(scene, lights=(sky(below=True),)), camera
 
@@ -100,7 +102,10 @@ def exported_look(fabric: FabricParameters, folder: Path, side: int, meters_per_
     if not source.exists():
         write_fabric(fabric, source)
     export(
-        source, out, ExportOptions("folder", MAPS, BakeSettings((side, 0)), meters_per_uv=meters_per_uv), lambda *_: None
+        source,
+        out,
+        ExportOptions("folder", MAPS, BakeSettings((side, 0)), meters_per_uv=meters_per_uv),
+        lambda *_: None,
     )
     stage = Usd.Stage.Open(str(out / "fabric_look.usda"))
     path = find_fabric(stage).GetPath()

@@ -64,5 +64,5 @@ def test_files_are_not_overwritten_unasked(tmp_path: Path) -> None:
     path = write_texture(tmp_path / "a.png", RAMP, color=False)
     with pytest.raises(UsdfabError, match="exists"):
         write_texture(path, RAMP, color=False)
-    with pytest.raises(UsdfabError, match="suffix|cannot write"):
+    with pytest.raises(UsdfabError, match="cannot write"):
         write_texture(tmp_path / "a.gif", RAMP, color=False)

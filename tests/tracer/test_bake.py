@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from scenes import cloth_material, dome, fabric, look, plane, scene
+
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, weave_from_name
 from usdfab.tracer import RenderSettings, Tracer

@@ -31,7 +31,9 @@ def run(
     u3m: Annotated[bool, Parameter(negative="", help="Write U3M 1.1: a folder, or a .u3ma file.")] = False,
     meters_per_uv: Annotated[
         str | None,
-        Parameter(help="Cloth that one unit of texture coordinates covers, e.g. 1m or 4mm; the fabric's own, else 1 m."),
+        Parameter(
+            help="Cloth that one unit of texture coordinates covers, e.g. 1m or 4mm; the fabric's own, else 1 m."
+        ),
     ] = None,
     prim: Annotated[str | None, Parameter(help="The fabric's Material, where the file holds several.")] = None,
     screenshot: Annotated[Path | None, Parameter(help="Also write the preview, all maps in one picture, here.")] = None,

@@ -26,7 +26,7 @@ from usdfab.imaging.u3m import (
     write_u3ma,
 )
 from usdfab.tracer.bake import BakeSettings, Side, bake
-from usdfab.tracer.bake_files import MapFormat, LookMaps, preview, write_maps
+from usdfab.tracer.bake_files import LookMaps, MapFormat, preview, write_maps
 from usdfab.tracer.bake_look import fit_look
 from usdfab.usd.fabric_io import read_fabric
 from usdfab.usd.look_layer import MapLook, cloth_scale, write_look
@@ -127,7 +127,9 @@ def _check_outputs(source: Path, output: Path, fabric: FabricParameters, options
             raise UsdfabError("the folder does not exist", place=place, remedy=f"create {place} first")
         main = f"{file_name(fabric.name)}.u3m" if options.kind == "u3m" else _look_name(source)
         files = [output / main, output / PREVIEW]
-        files += [output / MAPS_FOLDER / f"{name}.{options.format}" for name in options.maps if options.kind == "folder"]
+        files += [
+            output / MAPS_FOLDER / f"{name}.{options.format}" for name in options.maps if options.kind == "folder"
+        ]
         for file in files:
             if file.exists() and not over:
                 raise UsdfabError("the file exists", place=str(file), remedy="choose another name or use --overwrite")
@@ -193,13 +195,26 @@ def _write_layer(
 def _map_look(baked: LookMaps, files: dict[str, Path], kind: MapFormat) -> MapLook:
     maps, look = baked.maps, baked.look
     coverage = float(maps.opacity.mean())
-    through = tuple(max(t - (1.0 - coverage), 0.0) / max(coverage, 1e-6) for t in maps.transmittance)
-    albedo = tuple(float(c) for c in look.albedo.mean(axis=(0, 1), dtype=float))
+    red, green, blue = (max(t - (1.0 - coverage), 0.0) / max(coverage, 1e-6) for t in maps.transmittance)
+    exr = kind == "exr"
     return MapLook(
-        files=files, size=maps.size, signed_normals=kind == "exr", linear_albedo=kind == "exr",
-        albedo=albedo, roughness=float(look.roughness.mean()), opacity=coverage, ior=look.ior,
-        transmittance=through, fuzz=maps.loose, facts=baked.facts(),
-    )  # type: ignore[arg-type]  # fmt: skip
+        files=files,
+        size=maps.size,
+        signed_normals=exr,
+        linear_albedo=exr,
+        albedo=_mean_color(baked),
+        roughness=float(look.roughness.mean()),
+        opacity=coverage,
+        ior=look.ior,
+        transmittance=(red, green, blue),
+        fuzz=maps.loose,
+        facts=baked.facts(),
+    )
+
+
+def _mean_color(baked: LookMaps) -> tuple[float, float, float]:
+    red, green, blue = baked.look.albedo.mean(axis=(0, 1), dtype=float)
+    return float(red), float(green), float(blue)
 
 
 def _write_preview(folder: Path, baked: LookMaps, options: ExportOptions) -> Path:
@@ -271,7 +286,7 @@ def _visual(baked: LookMaps, files: dict[str, Path]) -> Visual:
             if map_name in files
         },
         constants={
-            "basecolor": look.albedo.mean(axis=(0, 1), dtype=float),
+            "basecolor": _mean_color(baked),
             "roughness": float(look.roughness.mean()),
             "alpha": coverage,
             "displacement": 1e3 * float(maps.height.mean()),

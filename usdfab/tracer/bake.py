@@ -204,7 +204,9 @@ def map_resolution(resolution: tuple[int, int], size: tuple[float, float]) -> tu
         height = max(1, round(width * size[1] / size[0]))
     if width < 4 or height < 4 or width * height > MAX_TEXELS:
         raise UsdfabError(
-            f"{width} x {height} texels", place="resolution", remedy=f"use 4 or more a side, {MAX_TEXELS} in all at most"
+            f"{width} x {height} texels",
+            place="resolution",
+            remedy=f"use 4 or more a side, {MAX_TEXELS} in all at most",
         )
     return width, height
 
@@ -249,24 +251,25 @@ class _Packed:
     def _maps(self, side: Side, layers: Map, through: NDArray, rays: int) -> BakedMaps:
         up = 1.0 if side == "front" else -1.0
         hits = layers[..., HITS]
-        some = np.maximum(hits, 1.0)
+        some: Map = np.maximum(hits, 1.0)
         seen = hits > 0
         mean = {name: layers[..., name] / some for name in (PLACE, SKY, WARP)}
-        bent = layers[..., BENT : BENT + 3] / some[..., None] * np.float32([1.0, 1.0, up])
+        bent = layers[..., BENT : BENT + 3] / some[..., None] * np.array([1.0, 1.0, up], np.float32)
         across = layers[..., ACROSS : ACROSS + 2] / some[..., None]
         color = layers[..., COLOR : COLOR + 3] / some[..., None]
-        place = np.float32(up) * mean[PLACE] / np.float32(self._scene.units_per_meter)
+        place: Map = np.float32(up) * mean[PLACE] / np.float32(self._scene.units_per_meter)
         place[~seen] = place[seen].min() if seen.any() else 0.0
         length = np.linalg.norm(bent, axis=-1)
-        normal = np.where(seen[..., None], bent / np.maximum(length, 1e-9)[..., None], np.float32([0.0, 0.0, 1.0]))
+        flat = np.array([0.0, 0.0, 1.0], np.float32)
+        normal = np.where(seen[..., None], bent / np.maximum(length, 1e-9)[..., None], flat)
         # Seen from above no visible normal points down, so that a mean does not either; that is up to rounding.
         normal[..., 2] = np.maximum(normal[..., 2], 1e-3)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-        shape = filled(np.concatenate([color, bent[..., 2:], place[..., None]], axis=-1), hits)
+        shape: Map = filled(np.concatenate([color, bent[..., 2:], place[..., None]], axis=-1), hits)
         # One sky ray for each ray makes grain that the eye sees.
-        sky = np.clip(guided(mean[SKY][..., None], shape[..., 3:], hits, AO_RADIUS), 0.0, 1.0)
+        sky = np.clip(guided(mean[SKY][..., None].astype(np.float32), shape[..., 3:], hits, AO_RADIUS), 0.0, 1.0)
         guides = np.concatenate([shape, sky], axis=-1)
-        noisy = layers[..., BACK : BACK + 3] / np.maximum(layers[..., PATHS], 1.0)[..., None]
+        noisy: Map = layers[..., BACK : BACK + 3] / np.maximum(layers[..., PATHS], 1.0)[..., None]
         reflectance = guided(noisy, guides, layers[..., PATHS], FILTER_RADIUS)
         coverage = float(hits.mean(dtype=np.float64)) / rays
         paths = max(float(through[3]), 1.0)

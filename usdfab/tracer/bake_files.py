@@ -169,5 +169,3 @@ def _shrunk(values: Map) -> Map:
         cut = values[: rows * step, : columns * step]
         values = cut.reshape(rows, step, columns, step, -1).mean(axis=(1, 3))
     return np.repeat(values, 3, axis=-1) if values.shape[-1] == 1 else values
-
-

@@ -1,12 +1,13 @@
-"""What a plain surface with baked maps must look like to be as bright as the fibers: its albedo and index of refraction.
+"""What a plain surface with baked maps must look like to be as bright as the fibers.
 
-A UsdPreviewSurface has one diffuse colour and one reflection for all lights; fibers have not. The two that cloth is
-mostly seen in decide, both viewed from straight above: a uniform sky, and the lamp of the capture rig near the camera's
-axis. Under the lamp a cloth is brighter, by about the same in all colours: that is its reflection. So the index of
-refraction comes from the difference and the diffuse colour from what remains: the baked reflectance times one factor
-per colour channel. The maps' normals and roughness stay as they are; what they do to brightness is in the factors.
+A UsdPreviewSurface has one diffuse colour and one reflection for all lights; fibers have not. The two lights in which
+cloth is mostly seen from straight above decide: a uniform sky, and the lamp of the capture rig near the camera's axis.
+Under the lamp cloth is brighter, by about the same in all colours: that is its reflection. So index of refraction,
+roughness and how far normals lean are tried until the surface gains as much from sky to lamp, staying near the fibers'
+own values where several do, and the diffuse colour is the baked reflectance times one factor for each channel.
 
-At other angles the surface differs from the fibers, most at grazing ones, where cloth is brighter (README, limits).
+Normals lean less than the fibers' (by about a half): each fiber scatters light that comes from behind it too, a surface
+does not. At other angles the surface differs from the fibers: cloth is brighter at grazing views, and anisotropic.
 """
 
 from __future__ import annotations

@@ -235,7 +235,7 @@ def _define_preview(material: UsdShade.Material, look: MapLook, paths: Mapping[s
         connect("roughness", types.Float, shader, "r")
     if "normal" in paths:
         shader = texture("NormalMap", "normal", "raw", (0.5, 0.5, 1.0, 1.0))
-        one, shift = ((1.0, 0.0) if look.signed_normals else (2.0, -1.0))
+        one, shift = (1.0, 0.0) if look.signed_normals else (2.0, -1.0)
         shader.CreateInput("scale", types.Float4).Set(Gf.Vec4f(one, one, one, 1.0))
         shader.CreateInput("bias", types.Float4).Set(Gf.Vec4f(shift, shift, shift, 0.0))
         if look.signed_normals:
@@ -246,4 +246,3 @@ def _define_preview(material: UsdShade.Material, look: MapLook, paths: Mapping[s
         connect("opacity", types.Float, shader, "r")
     surface.CreateInput("ior", types.Float).Set(look.ior)
     surface.CreateInput("metallic", types.Float).Set(0.0)
-

@@ -70,7 +70,9 @@ def define_open_pbr(material: UsdShade.Material, look: MapLook, paths: Mapping[s
         gain = Gf.Vec3f(1.0 / (1.0 - through))
         inputs["base_color"] = (
             types.Color3f,
-            node("MtlxBase", "ND_multiply_color3", types.Color3f, in1=(types.Color3f, color), in2=(types.Color3f, gain)),
+            node(
+                "MtlxBase", "ND_multiply_color3", types.Color3f, in1=(types.Color3f, color), in2=(types.Color3f, gain)
+            ),
         )
     if "roughness" in paths:
         found = image("MtlxRoughness", "roughness", "float", types.Float, look.roughness, "raw")
@@ -84,7 +86,11 @@ def define_open_pbr(material: UsdShade.Material, look: MapLook, paths: Mapping[s
         if look.signed_normals:  # the normal map node expects codes of [0, 1]
             half = Gf.Vec3f(0.5)
             found = node(
-                "MtlxNormalHalf", "ND_multiply_vector3", types.Float3, in1=(types.Float3, found), in2=(types.Float3, half)
+                "MtlxNormalHalf",
+                "ND_multiply_vector3",
+                types.Float3,
+                in1=(types.Float3, found),
+                in2=(types.Float3, half),
             )
             found = node(
                 "MtlxNormalCode", "ND_add_vector3", types.Float3, in1=(types.Float3, found), in2=(types.Float3, half)

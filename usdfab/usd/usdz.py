@@ -44,5 +44,7 @@ def write_usdz(source: str | Path, out: str | Path, *, overwrite: bool = False) 
             if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(source)), str(temporary)):
                 raise UsdfabError("USD could not write the package", place=str(target))
     except (OSError, Tf.ErrorException) as error:
-        raise UsdfabError(f"the package cannot be written ({str(error).splitlines()[-1]})", place=str(target)) from error
+        raise UsdfabError(
+            f"the package cannot be written ({str(error).splitlines()[-1]})", place=str(target)
+        ) from error
     return target, warnings
