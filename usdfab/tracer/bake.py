@@ -267,11 +267,10 @@ class _Packed:
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         shape: Map = filled(np.concatenate([color, bent[..., 2:], place[..., None]], axis=-1), hits)
         # One sky ray for each ray makes grain that the eye sees.
-        sky = np.clip(
-            guided(mean[SKY][..., None].astype(np.float32), shape[..., 3:], hits, AO_RADIUS), 0.0, 1.0
-        ).astype(np.float32)
+        sky = guided(mean[SKY][..., None].astype(np.float32), shape[..., 3:], hits, AO_RADIUS)
+        sky = np.clip(sky, 0.0, 1.0).astype(np.float32)
         guides = np.concatenate([shape, sky], axis=-1)
-        noisy: Map = layers[..., BACK : BACK + 3] / np.maximum(layers[..., PATHS], 1.0)[..., None]
+        noisy = (layers[..., BACK : BACK + 3] / np.maximum(layers[..., PATHS], 1.0)[..., None]).astype(np.float32)
         reflectance = guided(noisy, guides, layers[..., PATHS], FILTER_RADIUS)
         coverage = float(hits.mean(dtype=np.float64)) / rays
         paths = max(float(through[3]), 1.0)

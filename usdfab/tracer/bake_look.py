@@ -71,7 +71,7 @@ class Look:
 def _mean_values(roughness, normals, weights, albedo, directions, shares, f0, packed):
     """Weighted means over texels of what comes back to +z: (3,) of diffuse light, and of the reflection.
 
-    ``directions`` (N, 3) of the light, each with irradiance ``shares`` (N,) times pi on a plane that faces it.
+    ``directions`` (N, 3) towards the light, ``shares`` (N,) the irradiance of each on a plane that faces it.
     """
     diffuse, shine = np.zeros(3), 0.0
     for t in range(len(roughness)):
@@ -203,12 +203,11 @@ def lamp_reflectance(fabric: FabricParameters, *, threads: int | None = None, sp
 
 
 def _sky_lights(count: int) -> tuple[NDArray, NDArray]:
-    """Directions and shares of a uniform sky: equal parts of its irradiance, by the R2 sequence (Roberts 2018)."""
-    k = np.arange(1, count + 1)
-    u, phi = (0.7548776662466927 * k) % 1.0, 2.0 * math.pi * ((0.5698402909980532 * k) % 1.0)
-    z = np.sqrt(1.0 - u)
-    directions = np.stack([np.sqrt(u) * np.cos(phi), np.sqrt(u) * np.sin(phi), z], axis=1)
-    return directions, math.pi / z / len(k)
+    """Directions and shares of a uniform sky of radiance 1: equal solid angles on a Fibonacci spiral."""
+    k = np.arange(count) + 0.5
+    z, phi = k / count, 2.0 * math.pi * ((0.6180339887498949 * k) % 1.0)
+    flat = np.sqrt(1.0 - z * z)
+    return np.stack([flat * np.cos(phi), flat * np.sin(phi), z], axis=1), np.full(count, 2.0 * math.pi / count)
 
 
 def _lamp_lights() -> tuple[NDArray, NDArray]:
