@@ -243,9 +243,13 @@ class _Packed:
 
         through = np.zeros(4)
         with ThreadPoolExecutor(thread_count(settings.threads)) as pool:
-            for rows, part in pool.map(band, range(0, height, _ROWS)):
-                through += part
-                advance(rows)
+            try:
+                for rows, part in pool.map(band, range(0, height, _ROWS)):
+                    through += part
+                    advance(rows)
+            except BaseException:
+                pool.shutdown(cancel_futures=True)  # Ctrl-C: do not trace what is still waiting
+                raise
         return self._maps(side, layers, through, rays)
 
     def _maps(self, side: Side, layers: Map, through: NDArray, rays: int) -> BakedMaps:

@@ -28,7 +28,7 @@ from usdfab.tracer.render import RenderSettings, Tracer
 from usdfab.usd.rig import rig_for, swatch_scene
 from usdfab.usd.scene import PointLight
 
-COARSE, FINE = (1024, 32), (8192, 128)
+COARSE, FINE = (512, 24), (8192, 128)
 """Places that stand for all, and directions that stand for the sky: while searching, and in the end."""
 F0_TRIED = (0.015, 0.025, 0.035, 0.0465, 0.06, 0.08)
 """Reflectances at normal incidence that are tried: indices of refraction from 1.28 to 1.8; 1.55 is a fiber's."""
