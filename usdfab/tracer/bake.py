@@ -61,8 +61,8 @@ MAX_TEXELS = 2**25
 """Most texels of a map: 100 bytes each are needed while it is traced."""
 RAYS = 2**24
 """Rays for a whole map where nothing else is said, as far as a texel gets 16 to 256."""
-PATHS_IN_ALL = 2**21
-"""Rays of a map that go on as paths, as far as a texel gets 2 to 64: the filter makes up for few."""
+PATHS_IN_ALL = 2**20
+"""Rays of a map that go on as paths, as far as a texel gets 1 to 64: the filter makes up for few."""
 MAX_DEPTH = 512
 """Longest path: white fibers in white cloth go on for long, and roulette ends the others."""
 FILTER_RADIUS = 8
@@ -228,7 +228,7 @@ class _Packed:
     ) -> BakedMaps:
         """Trace all rows and turn sums into maps."""
         up = 1.0 if side == "front" else -1.0
-        paths = min(rays, int(np.clip(PATHS_IN_ALL // (width * height), 2, 64)))
+        paths = min(rays, int(np.clip(PATHS_IN_ALL // (width * height), 1, 64)))
         layers = np.empty((height, width, SUMS - 3), np.float32)
 
         def band(first: int) -> tuple[int, NDArray]:
