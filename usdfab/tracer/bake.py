@@ -66,7 +66,8 @@ PATHS_IN_ALL = 2**20
 MAX_DEPTH = 512
 """Longest path: white fibers in white cloth go on for long, and roulette ends the others."""
 FILTER_RADIUS = 8
-"""Half the window, in texels, in which reflectance is a linear function of the other maps."""
+"""Half the window, in texels, in which reflectance is a linear function of the other maps; up to twice as much where a
+texel has fewer than four paths."""
 AO_RADIUS = 2
 """The same for the ambient occlusion."""
 _ROWS = 16
@@ -275,7 +276,8 @@ class _Packed:
         sky = np.clip(sky, 0.0, 1.0).astype(np.float32)
         guides = np.concatenate([shape, sky], axis=-1)
         noisy = (layers[..., BACK : BACK + 3] / np.maximum(layers[..., PATHS], 1.0)[..., None]).astype(np.float32)
-        reflectance = guided(noisy, guides, layers[..., PATHS], FILTER_RADIUS)
+        radius = round(FILTER_RADIUS * np.sqrt(4.0 / min(max(float(layers[..., PATHS].max()), 1.0), 4.0)))
+        reflectance = guided(noisy, guides, layers[..., PATHS], radius)
         coverage = float(hits.mean(dtype=np.float64)) / rays
         paths = max(float(through[3]), 1.0)
         transmittance = tuple(float(1.0 - coverage + coverage * t / paths) for t in through[:3])
