@@ -57,7 +57,21 @@ def refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
 def test_help_lists_every_command_and_shows_examples() -> None:
     done = usdfab("--help")
     assert done.returncode == 0
-    names = {"fit", "render", "merge", "inspect", "bind", "expand", "new", "draft", "edit", "info", "check", "evaluate"}
+    names = {
+        "fit",
+        "render",
+        "merge",
+        "inspect",
+        "bind",
+        "expand",
+        "new",
+        "draft",
+        "edit",
+        "info",
+        "check",
+        "evaluate",
+        "export",
+    }
     assert names | {"schema"} == set(COMMANDS)
     for name in COMMANDS:
         assert name in done.stdout

@@ -36,6 +36,7 @@ COMMANDS = {
     "inspect": "Look at the fibers of a fabric, in a window or as a picture.",
     "bind": "Put a fabric on the cloth of a stage, and see how it stretches.",
     "expand": "Write the cloth of a stage as instanced fibers for any USD program.",
+    "export": "Bake a fabric into maps for any program: USD layer, MaterialX, USDZ, U3M.",
     "new": "Write a new fabric from a preset, a weave or a weavers' draft.",
     "edit": "Change a fabric, mix two, or give one several colourways.",
     "draft": "Write a fabric as a weavers' draft, or draw its drawdown.",

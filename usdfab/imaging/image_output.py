@@ -108,8 +108,8 @@ def write_image(
     if suffix == ".exr" and full_size is not None:
         spec.x, spec.y = offset
         spec.full_x, spec.full_y, spec.full_width, spec.full_height = 0, 0, *full_size
-    _describe(spec, suffix, pixel_size, metadata or {})
-    _save(oiio, target, spec, data)
+    describe(spec, suffix, pixel_size, metadata or {})
+    save_pixels(oiio, target, spec, data)
     return target
 
 
@@ -166,7 +166,7 @@ def _exr_channels(
     return data, names, kinds
 
 
-def _describe(spec: Any, suffix: str, pixel_size: PixelSize | None, metadata: Mapping[str, str]) -> None:
+def describe(spec: Any, suffix: str, pixel_size: PixelSize | None, metadata: Mapping[str, str]) -> None:
     """Colour space, compression, resolution and text of the header."""
     if suffix == ".exr":
         spec.attribute("oiio:ColorSpace", "lin_rec709_scene")
@@ -190,7 +190,7 @@ def _describe(spec: Any, suffix: str, pixel_size: PixelSize | None, metadata: Ma
         spec.attribute(name, text)
 
 
-def _save(oiio: Any, target: Path, spec: Any, data: NDArray[Any]) -> None:
+def save_pixels(oiio: Any, target: Path, spec: Any, data: NDArray[Any]) -> None:
     """Write beside the target, then rename."""
     place = str(target)
     # libjpeg ends the whole process on a full disk, so that one is asked about beforehand.

@@ -160,7 +160,7 @@ class Tracer:
         addresses = tuple(np.uint64(a) for a in (intersect, occluded, filter_address(), self._macro_scene.handle))
         self.world = World(
             macro,
-            _pack_patches(self._tiles),
+            pack_patches(self._tiles),
             materials,
             pack_textures(used, images),
             pack_lights(scene, dict(textures or {})),
@@ -271,7 +271,8 @@ def _view(camera: Camera, width: int, height: int, moves: bool) -> View:
     )
 
 
-def _pack_patches(scenes: list[PatchScene]) -> Patches:
+def pack_patches(scenes: list[PatchScene]) -> Patches:
+    """Tiles as kernels read them."""
     rows, segments, materials, count = [], 0, 0, 0
     curves = []
     for scene in scenes:
