@@ -15,11 +15,12 @@ from hypothesis import given, settings as hypothesis_settings, strategies as st
 from scenes import cloth_material, dome, fabric, lambert, plane, swatch
 
 from usdfab.errors import UsdfabError
+from usdfab.memory import available_memory
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.tracer.accumulate import ThreadRunner, accumulate
 from usdfab.tracer.checkpoint import Autosave, Identity, fingerprint, load_work, merge_work, resume_work, save_work
 from usdfab.tracer.film import ALPHA, CHANNELS, DEPTH, DIRECT, FIBER_ID, NORMAL, RGB, SAMPLES, UV, YARN_ID
-from usdfab.tracer.memory import available_memory, check_memory
+from usdfab.tracer.memory import check_memory
 from usdfab.tracer.render import Render, develop, resolve_region, start
 from usdfab.tracer.schedule import (
     BLOCK,

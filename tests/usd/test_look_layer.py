@@ -13,9 +13,10 @@ from pxr import Sdf, Usd, UsdShade
 from usdfab.errors import UsdfabError
 from usdfab.fabric import preset
 from usdfab.imaging.texture_file import write_texture
+from usdfab.usd.assets import relative_asset
 from usdfab.usd.check import check
 from usdfab.usd.fabric_io import FABRIC_PATH, read_fabric, read_meters_per_uv, write_fabric
-from usdfab.usd.look_layer import MapLook, cloth_scale, relative_asset, without_fibers, write_look
+from usdfab.usd.look_layer import MapLook, cloth_scale, without_fibers, write_look
 from usdfab.usd.problems import Problems
 from usdfab.usd.read_materials import read_material
 from usdfab.usd.scene import Material

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
 from usdfab.fibers import Patch, generate_patch
+from usdfab.fibers.tiles import MAX_TILE_SEGMENTS
 from usdfab.tracer import embree
 from usdfab.tracer.bake_filter import Map, filled, guided
 from usdfab.tracer.bake_kernel import (
@@ -52,7 +53,7 @@ from usdfab.tracer.bake_kernel import (
     bake_rows,
 )
 from usdfab.tracer.intrinsics import filter_address
-from usdfab.tracer.patch_scene import MAX_TILE_SEGMENTS, build_patch_scene
+from usdfab.tracer.patch_scene import build_patch_scene
 from usdfab.tracer.render import pack_patches, thread_count
 
 Side = Literal["front", "back"]

@@ -126,7 +126,7 @@ def _pack(light: Light, record: NDArray[np.float64]) -> None:
         record[1] = math.pi * np.max(light.radiance)
     else:
         if isinstance(light, SphereLight):
-            area = math.pi * light.radius**2
+            area = math.pi * light.radius * light.radius  # inf where a square would raise
             record[0], record[5:8], record[8] = SPHERE, light.center, light.radius
             record[20:23] = light.center
         elif isinstance(light, CylinderLight):

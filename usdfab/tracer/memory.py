@@ -2,38 +2,11 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 from usdfab.errors import UsdfabError
+from usdfab.memory import available_memory
 
 BYTES_PER_PIXEL = 400
 """Sums in double precision, the finished picture, and what its making needs for a moment."""
-
-
-def available_memory(root: Path = Path("/")) -> int | None:
-    """Bytes that can be had, by the kernel's estimate and the control group's limit; None where nobody knows.
-
-    ``root`` is where ``proc`` and ``sys`` are.
-    """
-    found = []
-    try:
-        for line in (root / "proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                found.append(1024 * int(line.split()[1]))
-    except (OSError, ValueError):  # not Linux
-        if hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
-            found.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    group = root / "sys/fs/cgroup"
-    for limit, used in (
-        ("memory.max", "memory.current"),
-        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
-    ):
-        try:
-            found.append(int((group / limit).read_text()) - int((group / used).read_text()))
-        except (OSError, ValueError):  # no such group, or "max"
-            continue
-    return max(0, min(found)) if found else None
 
 
 def check_memory(width: int, height: int) -> None:

@@ -8,7 +8,6 @@ so that the yarns of the maps lie where the fibers are.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from usdfab.errors import UsdfabError
+from usdfab.usd.assets import relative_asset
 from usdfab.usd.atomic import checked_output, export_layer
 from usdfab.usd.fabric_io import find_fabric, meters_per_uv_from_prim
 from usdfab.usd.look_materialx import define_open_pbr
@@ -67,23 +67,6 @@ class MapLook:
     transmittance: Color
     fuzz: float
     facts: Mapping[str, Any]
-
-
-def relative_asset(file: str | Path, folder: str | Path) -> str:
-    """``file`` as seen from ``folder``, as an asset path: relative, with forward slashes.
-
-    Raises
-    ------
-    UsdfabError
-        If there is no relative path (another drive).
-    """
-    try:
-        found = Path(os.path.relpath(Path(file).absolute(), Path(folder).absolute())).as_posix()
-    except ValueError as error:
-        raise UsdfabError(
-            "there is no relative path to this file", place=str(file), remedy="write to the same drive"
-        ) from error
-    return found if found.startswith(".") else f"./{found}"
 
 
 def cloth_scale(source: str | Path | Usd.Stage, prim: str | None = None, meters_per_uv: float | None = None) -> float:

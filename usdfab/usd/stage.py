@@ -13,6 +13,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom
 
 from usdfab._version import __version__
 from usdfab.errors import UsdfabError
+from usdfab.memory import bounded_memory
 from usdfab.usd.registration import require_schema
 
 GENERATOR = f"usdfab {__version__}"
@@ -44,7 +45,7 @@ def open_stage(source: str | Path | Usd.Stage) -> Usd.Stage:
         raise UsdfabError("this is not a USD file", place=str(path), remedy="USD files are .usda, .usdc, .usd, .usdz")
     if not os.access(path, os.R_OK):
         raise UsdfabError("the file is not readable", place=str(path), remedy="change its permissions")
-    with readable(path):
+    with bounded_memory(), readable(path):
         return Usd.Stage.Open(str(path))
 
 
@@ -55,6 +56,8 @@ def readable(path: str | Path) -> Iterator[None]:
         yield
     except Tf.ErrorException as error:
         raise UsdfabError(f"USD cannot read the file ({usd_reason(error)})", place=str(path)) from error
+    except MemoryError as error:
+        raise UsdfabError("USD needs more memory for this file than there is", place=str(path)) from error
 
 
 def usd_reason(error: RuntimeError) -> str:
