@@ -212,7 +212,7 @@ YARN_PARAMETERS: tuple[Parameter, ...] = (
         group="Appearance",
     ),
     Parameter(
-        "cuticle_tilt", "alpha_c", "rad", "float", 0.0, (-0.5, 0.5), (0.0, 0.07),
+        "cuticle_tilt", "alpha_c", "rad", "float", 0.0, (-0.39, 0.39), (0.0, 0.07),
         "Tilt of the fiber's scales; 0 for most textile fibers, 0.05 for wool.",
         group="Appearance",
     ),
