@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -314,10 +315,16 @@ def test_unwritable_output_is_found_before_the_work(tmp_path: Path, small: Path)
 def test_interrupt_ends_with_130_and_no_picture(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "x.png"
     arguments = ["render", str(small), "-o", str(out), "--resolution", "400", "--spp", "100000"]
-    process = subprocess.Popen([sys.executable, "-m", "usdfab.cli.main", *arguments], stderr=subprocess.PIPE, text=True)
-    time.sleep(15)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=120)
+    command = [sys.executable, "-m", "usdfab.cli.main", *arguments]
+    # A shell's background jobs, and with them these tests, may ignore interrupts, and children inherit that.
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heed) as process:
+        try:
+            time.sleep(15)
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=120)
+        finally:
+            process.kill()
     assert process.returncode == 130, errors
     assert "interrupted" in errors and "--resume" in errors
     assert list(tmp_path.iterdir()) == [tmp_path / "x.png.partial"]
