@@ -1,17 +1,18 @@
 """Fibers against their baked maps, seen from afar: brightness and blurred difference under several lights.
 
-    python tests/benchmarks/bench_export.py [denim linen ...] [--side 256] [--spp 64]
+    python tests/benchmarks/bench_export.py [denim linen ...] [--side 256] [--spp 64] [--smoke]
 
 Each fabric is exported as ``usdfab export`` does, its look layer is read back without the fabric schema, and both are
 rendered on the same mesh under the same lights. A ratio is the maps' mean over the fibers', by channel; the difference
-is the root mean square of the blurred pictures' difference over the fibers' mean.
+is the root mean square of the blurred pictures' difference over the fibers' mean. One line of JSON for each fabric.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
-import sys
+import os
 import tempfile
 import time
 from collections.abc import Iterator
@@ -24,7 +25,7 @@ from pxr import Usd
 from scipy.ndimage import gaussian_filter
 
 from usdfab.cli.export_files import ExportOptions, export
-from usdfab.fabric import FabricParameters, preset
+from usdfab.fabric import FabricParameters, YarnParameters, preset
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.tracer.bake import BakeSettings
 from usdfab.tracer.bake_files import MAPS
@@ -138,19 +139,33 @@ def compare(fabric: FabricParameters, side: int = 256, spp: int = 64, drape: boo
 
 
 def main() -> None:
-    """Print the table."""
+    """Print a line of JSON for each fabric."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("presets", nargs="*", default=PRESETS)
+    parser.add_argument("--smoke", action="store_true", help="a few seconds, to see that it runs")
     parser.add_argument("--side", type=int, default=256)
     parser.add_argument("--spp", type=int, default=64)
     arguments = parser.parse_args()
-    print("| fabric | view | red | green | blue | difference |\n|---|---|---|---|---|---|")
-    for name in arguments.presets:
+    for name in ["small"] if arguments.smoke else arguments.presets:
+        fabric, side, spp = (small(), 32, 2) if arguments.smoke else (preset(name), arguments.side, arguments.spp)
         start = time.perf_counter()
-        for row in compare(preset(name), arguments.side, arguments.spp):
-            red, green, blue = row.ratio
-            print(f"| {name} | {row.view} | {red:.3f} | {green:.3f} | {blue:.3f} | {row.difference:.3f} |", flush=True)
-        print(f"{name}: {time.perf_counter() - start:.0f} s", file=sys.stderr)
+        found = compare(fabric, side, spp, drape=not arguments.smoke)
+        table = {
+            row.view: {"ratio": row.ratio.round(4).tolist(), "difference": round(row.difference, 4)} for row in found
+        }
+        print(
+            json.dumps(
+                {"bench": "export", "fabric": name, "side": side, "spp": spp, "s": time.perf_counter() - start}
+                | {"load": os.getloadavg()[0], "views": table}
+            ),
+            flush=True,
+        )
+
+
+def small() -> FabricParameters:
+    """A fabric of few fibers."""
+    yarn = YarnParameters(count=6, radius=2.4e-4, fiber_count=6)
+    return FabricParameters(size=(3e-3, 3e-3), warp=yarn, weft=yarn, variants=1)
 
 
 if __name__ == "__main__":
