@@ -91,6 +91,18 @@ def test_the_report_of_a_stage(cloth_stage):
     assert surfaces(scene, 1.25, ("/Other",)) == []
 
 
+def test_yarns_that_are_meant_to_be_larger_are_not_stretched(cloth_stage):
+    """Half the metres per uv is what --scale 2 makes of a fabric."""
+    scene = read_scene(cloth_stage)
+    (usual,) = surfaces(scene, 1.25)
+    twice = replace(scene, fabrics=(replace(scene.fabrics[0], meters_per_uv=scene.fabrics[0].meters_per_uv / 2),))
+    (unmeant,), (meant,) = surfaces(twice, 1.25), surfaces(twice, 1.25, scale=2.0)
+    assert unmeant.report.above == pytest.approx(1.0) and meant.report.above == 0
+    assert unmeant.report.ends_per_cm.mean == pytest.approx(usual.report.ends_per_cm.mean / 2)
+    assert meant.report.ends_per_cm.mean == pytest.approx(usual.report.ends_per_cm.mean / 2)
+    assert meant.report.nominal_ends_per_cm == pytest.approx(usual.report.nominal_ends_per_cm / 2)
+
+
 def test_a_mirrored_side_is_named(cloth_stage):
     scene = read_scene(cloth_stage)
     mirrored = replace(scene, meshes=(replace(scene.meshes[0], uv=scene.meshes[0].uv * (-1, 1)),))

@@ -91,7 +91,7 @@ def run(
         stronger=stronger,
         overwrite=overwrite,
     )
-    scene, found, warnings = _measured(bound, stretch_limit)
+    scene, found, warnings = _measured(bound, stretch_limit, scale or 1.0)
     if screenshot is not None and scene is not None and found:
         from usdfab.view import stretch as view
 
@@ -123,7 +123,7 @@ def _selections(texts: list[str]) -> dict[str, str]:
     return {name: chosen for name, _, chosen in pairs}
 
 
-def _measured(bound: Bound, limit: float) -> tuple[Scene | None, list[Surface], list[str]]:
+def _measured(bound: Bound, limit: float, scale: float) -> tuple[Scene | None, list[Surface], list[str]]:
     """The bound stage, its surfaces with the fabric, and warnings; a stage that cannot be drawn is one of them."""
     from usdfab.errors import UsdfabError
     from usdfab.usd.read_scene import read_scene
@@ -133,7 +133,7 @@ def _measured(bound: Bound, limit: float) -> tuple[Scene | None, list[Surface], 
         scene = read_scene(bound.path, shutter=False)
     except UsdfabError as error:
         return None, [], [f"the stretch cannot be measured: {error}"]
-    found = surfaces(scene, limit, (bound.material,))
+    found = surfaces(scene, limit, (bound.material,), scale)
     # What concerns other prims of the stage is told when it is rendered.
     said = [text for text in scene.warnings if any(path in text for path in (*bound.meshes, bound.material))]
     if not found:

@@ -148,9 +148,10 @@ class Surface:
     report: SurfaceReport
 
 
-def surfaces(scene: Scene, limit: float, materials: Sequence[str] = ()) -> list[Surface]:
+def surfaces(scene: Scene, limit: float, materials: Sequence[str] = (), scale: float = 1.0) -> list[Surface]:
     """Every fabric on every mesh of a scene, or those of the given materials' paths only.
 
+    ``scale`` is how many times larger than life the yarns are meant to be: stretch is what comes on top of that.
     Placements of one mesh count as often as they are placed; see ``MAX_COPIES``.
     """
     found = []
@@ -164,10 +165,11 @@ def surfaces(scene: Scene, limit: float, materials: Sequence[str] = ()) -> list[
                 continue
             faces = fabric_of == number
             points, uv = _placed(mesh, faces)
-            measured = measure(points, uv, surface.meters_per_uv)
-            density = (0.01 / surface.fabric.cell[0], 0.01 / surface.fabric.cell[1])
+            meters = surface.meters_per_uv * scale
+            measured = measure(points, uv, meters)
+            density = (0.01 / (scale * surface.fabric.cell[0]), 0.01 / (scale * surface.fabric.cell[1]))
             report = _report(mesh.path, surface.path, surface.meters_per_uv, density, measured, limit)
-            found.append(Surface(points, uv * surface.meters_per_uv, measured, report))
+            found.append(Surface(points, uv * meters, measured, report))
     return found
 
 
