@@ -128,10 +128,10 @@ def _packaged() -> Iterator[Library]:
         located = [Path(str(file.locate())).resolve() for file in metadata.files(PACKAGE) or ()]
     except metadata.PackageNotFoundError:
         return
-    libraries = sorted({f for f in files if re.fullmatch(r"libLLVM[-\d.]*\.so[.\d]*", f.name) and f.is_file()})
-    runtime = {
-        f.name.split(".so")[0]: f for f in files if re.fullmatch(r"lib(c\+\+|c\+\+abi|unwind)\.so\.\d.*", f.name)
-    }
+    files = [f for f in located if ".so" in f.name and f.is_file()]
+    libraries = sorted({f for f in files if re.fullmatch(r"libLLVM[-\d.]*\.so[.\d]*", f.name)})
+    needed = re.compile(r"(lib(?:c\+\+|c\+\+abi|unwind))\.so\.\d.*")
+    runtime = {match[1]: f for f in files if (match := needed.fullmatch(f.name))}
     linked = all((f.parent / f"{name}.so.1").exists() for name, f in runtime.items())
     order = () if linked else ("libunwind", "libc++abi", "libc++")
     preload = tuple(str(runtime[name]) for name in order if name in runtime)
