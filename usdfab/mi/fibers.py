@@ -30,12 +30,13 @@ from usdfab.usd.expand.surface import ClothSurface
 from usdfab.usd.scene import Camera, FabricSurface, Mesh, Scene, Texture
 
 Floats = NDArray[np.float64]
+Window = tuple[float, float, float, float]
 FiberBsdf = Callable[[YarnParameters, Floats], dict[str, Any]]
 """A Mitsuba BSDF dictionary for fibers of a yarn system with albedo coefficient (3,)."""
 TextureReader = Callable[[Texture, Floats], Floats]
 """Colours (N, 3) of a texture at texture coordinates."""
 
-MAX_POINTS = 4_000_000
+MAX_POINTS = 8_000_000
 """Most control points: 1 GB with Mitsuba's acceleration structure."""
 
 MARGIN_CELLS = 4
@@ -66,7 +67,7 @@ def hair_bsdf(yarn: YarnParameters, albedo: Floats) -> dict[str, Any]:
 
 def hair_warnings(fabrics: Sequence[FabricParameters]) -> list[str]:
     """What Mitsuba's own hair BSDF cannot show of these fabrics."""
-    yarns = [f.system(s) for f in fabrics for s in ("warp", "weft")]  # type: ignore[arg-type]
+    yarns = [yarn for f in fabrics for yarn in (f.warp, f.weft)]
     warnings = []
     if any(y.roughness_primary != y.roughness_longitudinal for y in yarns):
         warnings.append("Mitsuba's hair has one longitudinal roughness: roughness_primary is left out")
@@ -104,11 +105,19 @@ class Cloth:
         return np.min([p.min(axis=0) for p in parts], axis=0), np.max([p.max(axis=0) for p in parts], axis=0)
 
 
-def make_cloth(scene: Scene, camera: Camera, textures: TextureReader | None, budget: int = MAX_POINTS) -> Cloth:
+def make_cloth(
+    scene: Scene,
+    camera: Camera,
+    textures: TextureReader | None,
+    budget: int = MAX_POINTS,
+    window: Window = (-1.0, -1.0, 1.0, 1.0),
+) -> Cloth:
     """The fibers of all fabrics of a scene.
 
     Parameters
     ----------
+    window:
+        (left, bottom, right, top) of the part of the film that is rendered, from -1 to 1.
     textures:
         Reads albedo maps; without it they are left out, with a warning.
     budget:
@@ -129,23 +138,24 @@ def make_cloth(scene: Scene, camera: Camera, textures: TextureReader | None, bud
     regions: list[Box | None] = [None] * len(pieces)
     warnings: list[str] = []
     if _needed(pieces, tiles, regions) > budget:
-        regions = [_seen(place, camera, surface.fabric) for _, surface, place in pieces]
+        regions = [_seen(place, camera, surface.fabric, window) for _, surface, place in pieces]
         needed = _needed(pieces, tiles, regions)
         if needed > budget:
             raise UsdfabError(
                 f"the cloth in view needs about {needed:.2g} control points, above {budget:.2g}",
                 place="--backend mitsuba",
-                remedy="use --backend embree, which needs no copies, or a camera that is closer",
+                remedy="use --backend embree, which needs no copies, or show less with --region or a closer camera",
             )
-        warnings.append(f"only the cloth in view and {MARGIN_CELLS} yarns around it are made of fibers, the rest is left out")
-    found, count = [], 0
+        warnings.append(
+            f"only the cloth in view and {MARGIN_CELLS} yarns around it are made of fibers, the rest is left out"
+        )
+    found: list[Fibers] = []
     for (_, surface, place), region in zip(pieces, regions, strict=True):
         if region == EMPTY or not len(place):
             continue
         tiling, variants = tiles[surface.fabric]
         baked = bake_curves(place, tiling, variants, _tint(surface, textures, warnings), region)
         found += [Fibers(surface.fabric.system(c.system), c) for c in baked]  # type: ignore[arg-type]
-        count += sum(len(c.points) for c in baked)
     return Cloth(tuple(found), tuple(dict.fromkeys(warnings)))
 
 
@@ -181,10 +191,10 @@ EMPTY: Box = (0.0, 0.0, 0.0, 0.0)
 """The region of cloth that the camera does not see."""
 
 
-def _seen(place: ClothSurface, camera: Camera, fabric: FabricParameters) -> Box:
+def _seen(place: ClothSurface, camera: Camera, fabric: FabricParameters, window: Window) -> Box:
     """The box of cloth, metres, that holds all places where camera rays meet it, with a margin."""
-    s = np.linspace(-1.0, 1.0, _RAYS) + camera.offset[0]
-    t = np.linspace(-1.0, 1.0, _RAYS) + camera.offset[1]
+    s = np.linspace(window[0], window[2], _RAYS) + camera.offset[0]
+    t = np.linspace(window[1], window[3], _RAYS) + camera.offset[1]
     x, y = np.meshgrid(camera.tan_half[0] * s, camera.tan_half[1] * t)
     directions = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.0)], axis=1) @ camera.to_world[:3, :3].T
     places = [_met(place, camera.to_world[:3, 3], d) for d in directions]
@@ -224,9 +234,12 @@ def _tint(surface: FabricSurface, textures: TextureReader | None, warnings: list
     return lambda uv, colors: colors * textures(texture, uv)
 
 
-def curve_shapes(cloth: Cloth, space: Space, bsdf: FiberBsdf, folder: Path) -> tuple[dict[str, dict[str, Any]], list[str]]:
+def curve_shapes(
+    cloth: Cloth, space: Space, bsdf: FiberBsdf, folder: Path
+) -> tuple[dict[str, dict[str, Any]], list[str]]:
     """Mitsuba dictionaries of all curves, one for each colour of a yarn system; their files are put into ``folder``."""
-    shapes, warnings = {}, []
+    shapes: dict[str, dict[str, Any]] = {}
+    warnings: list[str] = []
     for fibers in cloth.fibers:
         curves = fibers.curves
         colors = curves.color
@@ -241,7 +254,11 @@ def curve_shapes(cloth: Cloth, space: Space, bsdf: FiberBsdf, folder: Path) -> t
         for number, color in enumerate(found):
             name = f"fibers{len(shapes)}"
             write_curves(folder / f"{name}.txt", curves, which.ravel() == number, space)
-            shapes[name] = {"type": "bsplinecurve", "filename": str(folder / f"{name}.txt"), "bsdf": bsdf(fibers.yarn, color)}
+            shapes[name] = {
+                "type": "bsplinecurve",
+                "filename": str(folder / f"{name}.txt"),
+                "bsdf": bsdf(fibers.yarn, color),
+            }
     return shapes, list(dict.fromkeys(warnings))
 
 

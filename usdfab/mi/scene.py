@@ -74,7 +74,9 @@ def translate(
     """
     if not scene.meshes:
         raise UsdfabError("the stage has no visible mesh", place=scene.path, remedy="add a Mesh or check visibility")
-    cloth = make_cloth(scene, camera, textures, budget)
+    left, right = (2.0 * region[k] / size[0] - 1.0 for k in (0, 2))
+    bottom, top = (1.0 - 2.0 * region[k] / size[1] for k in (3, 1))
+    cloth = make_cloth(scene, camera, textures, budget, (left, bottom, right, top))
     warnings = list(cloth.warnings)
     if fiber_bsdf is None:
         warnings += hair_warnings([f.fabric for f in scene.fabrics])
@@ -84,7 +86,9 @@ def translate(
     space = Space(FIBER_UNITS / thinnest if thinnest else 100.0 / max(extent, 1e-12), 0.5 * (low + high))
     offset = RAY_OFFSET * (1.0 + 0.5 * space.scale * extent) / FIBER_UNITS
     if thinnest and offset > 0.2:
-        warnings.append(f"Mitsuba's rays start up to {offset:.1f} fiber radii off the fibers: look at less cloth at once")
+        warnings.append(
+            f"Mitsuba's rays start up to {offset:.1f} fiber radii off the fibers: look at less cloth at once"
+        )
     view, said = sensor(mi, camera, size, region, space)
     warnings += said
     curves, said = curve_shapes(cloth, space, fiber_bsdf or hair_bsdf, folder)

@@ -3,8 +3,8 @@
 What differs from the tracer. ``principled`` has Disney's diffuse lobe, which is darker or brighter towards grazing
 angles by its roughness, and its own energy balance between the lobes; its coat is weighted by a quarter and has another
 roughness scale; specularColor is not known to it. So pictures agree to a few percent there, while a surface without
-specular (an index of refraction below 1.07) is exactly Lambert in both. Normal maps are left out. Textures are resampled to
-``TEXELS`` on a side over what the mesh uses of them.
+specular (an index of refraction below 1.07) is exactly Lambert in both. Normal maps are left out. Textures are
+resampled to ``TEXELS`` on a side over what the mesh uses of them.
 """
 
 from __future__ import annotations
