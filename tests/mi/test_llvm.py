@@ -217,3 +217,19 @@ def test_llvm_works_where_there_is_one():
     code = "from usdfab.mi.variant import load; mi = load('llvm'); print(mi.variant(), mi.Float([1, 2]) + 1)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split(maxsplit=1) == ["llvm_ad_rgb", "[2, 3]\n"]
+
+
+def test_drjit_that_others_imported_with_another_library_is_refused():
+    pytest.importorskip("mitsuba")
+    choice = llvm.choose()
+    if choice.library is None:
+        pytest.skip(f"no LLVM here: {choice.refusals}")
+    code = (
+        "import drjit\nfrom usdfab.mi.variant import load\n"
+        "try:\n    print(load('llvm').Float([1]) + 1)\nexcept Exception as error:\n    print(error)\n"
+    )
+    # Dr.Jit does not try another file where this one is no library.
+    for path, expected in ((choice.library.path, "[2]"), (__file__, "Dr.Jit was imported without LLVM")):
+        environment = os.environ | {llvm.VARIABLE: path}
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+        assert expected in done.stdout, done.stdout

@@ -77,6 +77,6 @@ def sensor(
         found["aperture_radius"] = camera.lens_radius * space.scale
         found["focus_distance"] = camera.focus_distance * space.scale
     else:
-        found["principal_point_offset_x"] = -0.5 * float(camera.offset[0])
-        found["principal_point_offset_y"] = 0.5 * float(camera.offset[1])
+        found["principal_point_offset_x"] = 0.5 * float(camera.offset[0])
+        found["principal_point_offset_y"] = -0.5 * float(camera.offset[1])
     return found, warnings

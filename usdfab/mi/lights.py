@@ -1,8 +1,8 @@
 """Lights as Mitsuba emitters.
 
 What differs from the tracer: a distant light with an angle is a disk so far away that it cannot be told from infinity,
-which a camera that looks at it sees; a dome's picture is interpolated between texels by Mitsuba's own rule. A lamp's
-other side is black, as there.
+which a camera that looks at it sees; texels of a dome's picture are blended at their edges. A lamp's other side is
+black, as there.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ from usdfab.usd.scene import (
 
 INFINITY = 1e4
 """How far away disks stand that stand for distant lights, in radii of the scene."""
+
+ENVIRONMENT_ROWS = 1024
+"""Pictures of domes with fewer rows are drawn with each texel repeated."""
 
 _BLACK = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
 Description = dict[str, Any]
@@ -128,7 +131,9 @@ def _environment(mi: Any, domes: Sequence[DomeLight], textures: Mapping[str, NDA
             pictured, image = dome, np.asarray(own, dtype=np.float64)[..., :3] * dome.radiance
     if pictured is None or image is None:
         return {"type": "constant", "radiance": rgb(constant)}
-    bitmap = mi.Bitmap(np.ascontiguousarray(image + constant, dtype=np.float32))
+    # The tracer's texels have edges; Mitsuba blends their middles, and puts the first and last row on the poles.
+    finer = np.ones((max(1, ENVIRONMENT_ROWS // len(image)),) * 2 + (1,))
+    bitmap = mi.Bitmap(np.ascontiguousarray(np.kron(image + constant, finer), dtype=np.float32))
     # The dome's own space is Mitsuba's: +y up, the picture's middle in +z.
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(pictured.to_world)}
 

@@ -1,8 +1,9 @@
 """Choosing the LLVM library with which Dr.Jit compiles, before Dr.Jit is imported.
 
-Dr.Jit takes the first ``libLLVM`` that it finds, and an unfit one ends the process: LLVM 15 with "Cannot select" on
-some processors, none at all with a division by zero at the first array. So each candidate is tried in a process of its
-own (``probe.py``), in this order: DRJIT_LIBLLVM_PATH, the package ``karellen-llvm-core``, the system's libraries.
+Dr.Jit loads the first ``libLLVM`` that it finds when it is imported, and an unfit one ends the process: LLVM 15 with
+"Cannot select" on some processors, none at all with a division by zero at the first array. So each candidate is tried
+in a process of its own (``probe.py``), in this order: DRJIT_LIBLLVM_PATH, the package ``karellen-llvm-core``, the
+system's libraries.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ def try_library(library: Library) -> Verdict:
 
 
 def use(library: Library) -> None:
-    """Make Dr.Jit, which must not have used LLVM yet, load this library."""
+    """Make Dr.Jit, which must not have been imported yet, load this library."""
     for needed in library.preload:
         ctypes.CDLL(needed, mode=ctypes.RTLD_GLOBAL)
     os.environ[VARIABLE] = library.path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -35,29 +36,42 @@ def load(device: str = "auto") -> Any:
         If Mitsuba is not installed, the device is not there, or no LLVM library works. Nothing has been loaded then.
     """
     name = resolve_device(device)
-    if name == "llvm":
-        chosen = llvm.choose().library
-        assert chosen is not None, "resolve_device has asked"
-        llvm.use(chosen)
+    prepare()
     try:
         import mitsuba
     except ImportError as error:
         raise UsdfabError(f"Mitsuba cannot be loaded ({error})", remedy=INSTALL) from error
     if name == "llvm":
-        _require_backend()
+        _require_chosen()
     if mitsuba.variant() != VARIANTS[name]:
         mitsuba.set_variant(VARIANTS[name])
     return mitsuba
 
 
-def _require_backend() -> None:
-    """Dr.Jit may have been used by others before a library was chosen for it: it looks for one only once."""
+def prepare() -> None:
+    """Choose the LLVM library for whoever imports ``drjit`` or ``mitsuba`` after this.
+
+    Dr.Jit loads its library when it is imported, once and for all: the first that it finds, fit or not.
+    """
+    if "drjit" in sys.modules or find_spec("drjit") is None:
+        return
+    chosen = llvm.choose().library
+    if chosen is not None:
+        llvm.use(chosen)
+
+
+def _require_chosen() -> None:
+    """``UsdfabError`` if Dr.Jit was imported by others before ``prepare``, with another library: it may be unfit."""
     import drjit
 
-    if not drjit.has_backend(drjit.JitBackend.LLVM):
+    loaded = ".".join(str(n) for n in drjit.detail.llvm_version())
+    chosen = llvm.choose().library
+    assert chosen is not None, "resolve_device has asked"
+    if loaded != llvm.try_library(chosen).version:
+        found = f"with LLVM {loaded}" if not loaded.startswith("-") else "without LLVM"
         raise UsdfabError(
-            "Dr.Jit was used before an LLVM library was chosen for it",
-            remedy="load Mitsuba through usdfab.mi.variant first",
+            f"Dr.Jit was imported {found} before a library was chosen for it",
+            remedy=f"load Mitsuba by usdfab.mi.variant.load first, or set {llvm.VARIABLE}={chosen.path}",
         )
 
 
