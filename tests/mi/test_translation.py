@@ -14,13 +14,16 @@ pytest.importorskip("mitsuba")
 sys.path.insert(0, str(Path(__file__).parents[1] / "tracer"))
 
 import scenes
+from hypothesis import given, strategies as st
+from hypothesis.extra import numpy as hnp
 
 from usdfab.errors import UsdfabError
 from usdfab.mi.camera import sensor
-from usdfab.mi.fibers import MARGIN_CELLS, make_cloth
+from usdfab.mi.fibers import make_cloth
 from usdfab.mi.render import MitsubaSettings, passes, render
 from usdfab.mi.space import Space
 from usdfab.mi.variant import load
+from usdfab.mi.visible import MARGIN_CELLS, boxes_around
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.scene import (
     CylinderLight,
@@ -208,3 +211,22 @@ def test_passes():
     many = passes(1000, 1_000_000)
     assert sum(many) == 1000 and max(many) <= 2
     assert math.isclose(sum(passes(7, 10**9)), 7)
+
+
+@given(
+    hnp.arrays(np.float64, st.tuples(st.integers(1, 40), st.just(2)), elements=st.floats(-20, 20)), st.floats(0.05, 3.0)
+)
+def test_boxes_hold_every_place_and_do_not_overlap(places, margin):
+    boxes = np.array(boxes_around(places, margin))
+    inside = (places[:, None] - margin >= boxes[None, :, :2] - 1e-9) & (
+        places[:, None] + margin <= boxes[None, :, 2:] + 1e-9
+    )
+    assert inside.all(axis=2).any(axis=1).all()
+    for k, box in enumerate(boxes):
+        others = np.delete(boxes, k, axis=0)
+        assert not ((others[:, :2] < box[2:]) & (others[:, 2:] > box[:2])).all(axis=1).any()
+
+
+def test_groups_far_apart_have_boxes_of_their_own():
+    assert len(boxes_around(np.array([[0.0, 0.0], [0.5, 0.2], [9.0, 0.0]]), 1.0)) == 2
+    assert boxes_around(np.zeros((0, 2)), 1.0) == []

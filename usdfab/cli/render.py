@@ -110,7 +110,7 @@ def run(
             "--time": time, "--noise": noise, "--frames": frames, "--aov": aov, "--denoise": denoise, "--tile": tile,
             "--checkpoint": checkpoint, "--resume": resume, "--workers": workers, "--scheduler": scheduler,
         }  # fmt: skip
-        wrong = next((option for option, value in refused.items() if value not in (None, False)), None)
+        wrong = next((option for option, value in refused.items() if value is not None and value is not False), None)
         if wrong:
             raise UsdfabError("the Mitsuba backend has no such option", place=wrong, remedy="use --backend embree")
     elif backend != "embree":

@@ -20,6 +20,7 @@ from usdfab.fabric import FabricParameters, YarnParameters
 from usdfab.fibers import patch_variants
 from usdfab.fibers.tiles import tile_copies
 from usdfab.mi.space import Space
+from usdfab.mi.visible import MARGIN_CELLS, Window, visible_boxes
 from usdfab.scattering.roughness import absorption_from_albedo
 from usdfab.usd.expand.bake import bake_curves
 from usdfab.usd.expand.centres import estimate
@@ -30,7 +31,6 @@ from usdfab.usd.expand.surface import ClothSurface
 from usdfab.usd.scene import Camera, FabricSurface, Mesh, Scene, Texture
 
 Floats = NDArray[np.float64]
-Window = tuple[float, float, float, float]
 FiberBsdf = Callable[[YarnParameters, Floats], dict[str, Any]]
 """A Mitsuba BSDF dictionary for fibers of a yarn system with albedo coefficient (3,)."""
 TextureReader = Callable[[Texture, Floats], Floats]
@@ -39,14 +39,8 @@ TextureReader = Callable[[Texture, Floats], Floats]
 MAX_POINTS = 8_000_000
 """Most control points: 1 GB with Mitsuba's acceleration structure."""
 
-MARGIN_CELLS = 4
-"""Cells of the weave around what the camera sees that are made too: what light from there adds can be seen."""
-
 MAX_COLORS = 128
 """Most different colours of fibers, each of which is a BSDF of its own; beyond that they are rounded."""
-
-_RAYS = 48
-"""Rays on each side of the picture with which the visible cloth is found."""
 
 
 def hair_bsdf(yarn: YarnParameters, albedo: Floats) -> dict[str, Any]:
@@ -135,10 +129,10 @@ def make_cloth(
         for copy in ([None] if mesh.placements is None else range(len(mesh.placements)))
     ]
     tiles = {surface.fabric: _tile(surface.fabric) for _, surface, _ in pieces}
-    regions: list[Box | None] = [None] * len(pieces)
+    regions: list[list[Box] | None] = [None] * len(pieces)
     warnings: list[str] = []
     if _needed(pieces, tiles, regions) > budget:
-        regions = [_seen(place, camera, surface.fabric, window) for _, surface, place in pieces]
+        regions = [visible_boxes(place, camera, surface.fabric, window) for _, surface, place in pieces]
         needed = _needed(pieces, tiles, regions)
         if needed > budget:
             raise UsdfabError(
@@ -150,12 +144,12 @@ def make_cloth(
             f"only the cloth in view and {MARGIN_CELLS} yarns around it are made of fibers, the rest is left out"
         )
     found: list[Fibers] = []
-    for (_, surface, place), region in zip(pieces, regions, strict=True):
-        if region == EMPTY or not len(place):
-            continue
+    for (_, surface, place), boxes in zip(pieces, regions, strict=True):
         tiling, variants = tiles[surface.fabric]
-        baked = bake_curves(place, tiling, variants, _tint(surface, textures, warnings), region)
-        found += [Fibers(surface.fabric.system(c.system), c) for c in baked]  # type: ignore[arg-type]
+        tint = _tint(surface, textures, warnings)
+        for box in [None] if boxes is None else boxes:
+            baked = bake_curves(place, tiling, variants, tint, box) if len(place) else []
+            found += [Fibers(surface.fabric.system(c.system), c) for c in baked]  # type: ignore[arg-type]
     return Cloth(tuple(found), tuple(dict.fromkeys(warnings)))
 
 
@@ -177,51 +171,14 @@ def _tile(fabric: FabricParameters) -> tuple[Tiling, list[list[FiberCurves]]]:
 def _needed(pieces: Sequence[tuple[Mesh, FabricSurface, ClothSurface]], tiles: dict, regions: Sequence) -> float:
     """About how many control points the pieces take."""
     total = 0.0
-    for (_, surface, place), region in zip(pieces, regions, strict=True):
+    for (_, surface, place), boxes in zip(pieces, regions, strict=True):
         tiling, variants = tiles[surface.fabric]
         number = estimate(place.xy, tiling.size)
-        if region is not None:
-            area = max(region[2] - region[0], 0.0) * max(region[3] - region[1], 0.0)
+        if boxes is not None:
+            area = sum((x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in boxes)
             number = min(number, area / (tiling.size[0] * tiling.size[1]))
         total += number * sum(len(c.points) for c in variants[0])
     return total
-
-
-EMPTY: Box = (0.0, 0.0, 0.0, 0.0)
-"""The region of cloth that the camera does not see."""
-
-
-def _seen(place: ClothSurface, camera: Camera, fabric: FabricParameters, window: Window) -> Box:
-    """The box of cloth, metres, that holds all places where camera rays meet it, with a margin."""
-    s = np.linspace(window[0], window[2], _RAYS) + camera.offset[0]
-    t = np.linspace(window[1], window[3], _RAYS) + camera.offset[1]
-    x, y = np.meshgrid(camera.tan_half[0] * s, camera.tan_half[1] * t)
-    directions = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.0)], axis=1) @ camera.to_world[:3, :3].T
-    places = [_met(place, camera.to_world[:3, 3], d) for d in directions]
-    xy = np.concatenate(places)
-    if len(xy) == 0:
-        return EMPTY
-    margin = MARGIN_CELLS * max(fabric.cell)
-    low, high = xy.min(axis=0) - margin, xy.max(axis=0) + margin
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-
-def _met(place: ClothSurface, origin: Floats, direction: Floats) -> Floats:
-    """(N, 2) places of the cloth, metres, at which a ray meets its triangles, all layers (Moeller and Trumbore)."""
-    a = place.points[:, 0]
-    e1, e2 = place.points[:, 1] - a, place.points[:, 2] - a
-    p = np.cross(direction, e2)
-    determinant = np.einsum("tx,tx->t", e1, p)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / determinant
-        q = origin - a
-        u = np.einsum("tx,tx->t", q, p) * inverse
-        r = np.cross(q, e1)
-        v = r @ direction * inverse
-        t = np.einsum("tx,tx->t", e2, r) * inverse
-        hit = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0)
-    weights = np.stack([1.0 - u - v, u, v], axis=1)[hit]
-    return np.einsum("tc,tcx->tx", weights, place.xy[hit])
 
 
 def _tint(surface: FabricSurface, textures: TextureReader | None, warnings: list[str]) -> Tint:
