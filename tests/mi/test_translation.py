@@ -230,3 +230,24 @@ def test_boxes_hold_every_place_and_do_not_overlap(places, margin):
 def test_groups_far_apart_have_boxes_of_their_own():
     assert len(boxes_around(np.array([[0.0, 0.0], [0.5, 0.2], [9.0, 0.0]]), 1.0)) == 2
     assert boxes_around(np.zeros((0, 2)), 1.0) == []
+
+
+def test_cloth_out_of_view_is_a_surface():
+    cloth = scenes.fabric(fibers=3)
+    corners = (np.stack(np.meshgrid(np.arange(12), np.arange(12)), axis=-1).reshape(-1, 2) - 6.0) * 4e-3
+    squares = [replace(scenes.plane(4e-3, 0, 0.0, c), uv=scenes.plane(4e-3, 0, 0.0, c).uv) for c in corners]
+    points = np.concatenate([s.points for s in squares])
+    triangles = np.concatenate([s.triangles + 4 * k for k, s in enumerate(squares)]).astype(np.int32)
+    uv = np.concatenate([s.uv for s in squares])
+    sheet = replace(squares[0], points=points, triangles=triangles, uv=uv, face_material=np.zeros(len(uv), np.int32))
+    view = scenes.look((0.0, 0.0, 0.05), (0.0, 0.0, 0.0), (0.02, 0.02))
+    scene = scenes.scene([sheet], [scenes.cloth_material()], [scenes.dome()], [cloth])
+    whole = make_cloth(scene, view, None, budget=10**9)
+    part = make_cloth(scene, view, None, budget=whole.points // 4)
+    assert not whole.rest and len(part.rest) == 1
+    reach = 1e-3 + MARGIN_CELLS * 0.5e-3
+    middle = uv[part.rest[0].faces]
+    assert 200 < len(middle) < len(uv), "most of the sheet"
+    assert (np.abs(middle).max(axis=2).max(axis=1) >= reach - 1e-9).all()
+    near = (np.abs(uv).max(axis=2) < reach).any(axis=1)
+    assert not part.rest[0].faces[near].any(), "no surface among the fibers"

@@ -1,14 +1,14 @@
 """Fabrics as Mitsuba curves: the same fibers as the tracer's, tile by tile, bent onto the mesh.
 
 Every control point of every tile is made, so this is for close-ups and small cloth, up to a budget. Where the whole
-cloth is too much, only what the camera sees is made, with a margin around it.
+cloth is too much, only what the camera sees is made, with a margin around it; the rest of the mesh is a surface.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -79,10 +79,20 @@ class Fibers:
 
 
 @dataclass(frozen=True, eq=False)
+class Rest:
+    """The triangles (T,) of a mesh, or of one of its copies, that wear a fabric but are not made of fibers."""
+
+    mesh: Mesh
+    faces: NDArray[np.bool_]
+    copy: int | None
+
+
+@dataclass(frozen=True, eq=False)
 class Cloth:
-    """All fibers of a scene, and what is to be told."""
+    """All fibers of a scene, cloth without fibers, and what is to be told."""
 
     fibers: tuple[Fibers, ...]
+    rest: tuple[Rest, ...]
     warnings: tuple[str, ...]
 
     @property
@@ -123,7 +133,7 @@ def make_cloth(
         If the cloth that the camera sees takes more; nothing large has been made then.
     """
     pieces = [
-        (mesh, surface, ClothSurface(mesh, surface, faces, copy))
+        (Rest(mesh, faces, copy), surface, ClothSurface(mesh, surface, faces, copy))
         for mesh in scene.meshes
         for surface, faces in _worn(scene, mesh)
         for copy in ([None] if mesh.placements is None else range(len(mesh.placements)))
@@ -141,16 +151,20 @@ def make_cloth(
                 remedy="use --backend embree, which needs no copies, or show less with --region or a closer camera",
             )
         warnings.append(
-            f"only the cloth in view and {MARGIN_CELLS} yarns around it are made of fibers, the rest is left out"
+            f"only the cloth in view and {MARGIN_CELLS} yarns around it are fibers; the rest is an opaque surface, so that "
+            "light from there and through it is only about right"
         )
     found: list[Fibers] = []
-    for (_, surface, place), boxes in zip(pieces, regions, strict=True):
+    rest: list[Rest] = []
+    for (whole, surface, place), boxes in zip(pieces, regions, strict=True):
+        if boxes is not None:
+            rest.append(replace(whole, faces=_outside(whole, surface, boxes)))
         tiling, variants = tiles[surface.fabric]
         tint = _tint(surface, textures, warnings)
         for box in [None] if boxes is None else boxes:
             baked = bake_curves(place, tiling, variants, tint, box) if len(place) else []
             found += [Fibers(surface.fabric.system(c.system), c) for c in baked]  # type: ignore[arg-type]
-    return Cloth(tuple(found), tuple(dict.fromkeys(warnings)))
+    return Cloth(tuple(found), tuple(rest), tuple(dict.fromkeys(warnings)))
 
 
 def _worn(scene: Scene, mesh: Mesh) -> list[tuple[FabricSurface, NDArray[np.bool_]]]:
@@ -168,7 +182,7 @@ def _tile(fabric: FabricParameters) -> tuple[Tiling, list[list[FiberCurves]]]:
     return tiling, [list(tile_curves(patch)) for patch in patches]
 
 
-def _needed(pieces: Sequence[tuple[Mesh, FabricSurface, ClothSurface]], tiles: dict, regions: Sequence) -> float:
+def _needed(pieces: Sequence[tuple[Rest, FabricSurface, ClothSurface]], tiles: dict, regions: Sequence) -> float:
     """About how many control points the pieces take."""
     total = 0.0
     for (_, surface, place), boxes in zip(pieces, regions, strict=True):
@@ -179,6 +193,17 @@ def _needed(pieces: Sequence[tuple[Mesh, FabricSurface, ClothSurface]], tiles: d
             number = min(number, area / (tiling.size[0] * tiling.size[1]))
         total += number * sum(len(c.points) for c in variants[0])
     return total
+
+
+def _outside(whole: Rest, surface: FabricSurface, boxes: Sequence[Box]) -> NDArray[np.bool_]:
+    """(T,) which of the faces have no part in any box: a gap is better than fibers in a surface."""
+    assert whole.mesh.uv is not None, "a mesh with a fabric has uv"
+    xy = whole.mesh.uv * surface.meters_per_uv
+    low, high = xy.min(axis=1), xy.max(axis=1)
+    outside = whole.faces.copy()
+    for x0, y0, x1, y1 in boxes:
+        outside &= ((high <= (x0, y0)) | (low >= (x1, y1))).any(axis=1)
+    return outside
 
 
 def _tint(surface: FabricSurface, textures: TextureReader | None, warnings: list[str]) -> Tint:

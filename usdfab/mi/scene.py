@@ -93,7 +93,7 @@ def translate(
     warnings += said
     curves, said = curve_shapes(cloth, space, fiber_bsdf or hair_bsdf, folder)
     warnings += said
-    meshes, said = surface_shapes(mi, scene, textures, space, folder)
+    meshes, said = surface_shapes(mi, scene, cloth.rest, textures, space, folder)
     warnings += said
     far = np.abs(np.stack(_bounds(scene)) - space.origin).max(axis=0)
     radius = float(np.linalg.norm(far)) + float(np.linalg.norm(camera.to_world[:3, 3] - space.origin))

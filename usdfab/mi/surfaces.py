@@ -9,13 +9,14 @@ resampled to ``TEXELS`` on a side over what the mesh uses of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from usdfab.mi.fibers import Rest
 from usdfab.mi.lights import rgb
 from usdfab.mi.space import Space
 from usdfab.usd.scene import Material, Mesh, Scene, Texture
@@ -33,22 +34,27 @@ _KNOWN = ("diffuseColor", "roughness", "metallic", "opacity", "emissiveColor")
 
 
 def surface_shapes(
-    mi: Any, scene: Scene, textures: TextureReader | None, space: Space, folder: Path
+    mi: Any, scene: Scene, rest: Sequence[Rest], textures: TextureReader | None, space: Space, folder: Path
 ) -> tuple[dict[str, Description], list[str]]:
-    """Mitsuba dictionaries of all faces that wear no fabric, by mesh, copy and material; and what was left out."""
+    """Mitsuba dictionaries of all that is not made of fibers, by mesh, copy and material; and what was left out.
+
+    ``rest`` is cloth without fibers, which is drawn as its material's preview surface.
+    """
     shapes: dict[str, Description] = {}
     warnings: list[str] = []
+    worn = np.array([m.fabric >= 0 for m in scene.materials])
     for mesh in scene.meshes:
         if mesh.points_close is not None or mesh.placements_close is not None:
             warnings.append(f"{mesh.path}: the Mitsuba backend has no motion blur, the shutter's opening is shown")
-        for index in np.unique(mesh.face_material):
+    bare = [Rest(mesh, ~worn[mesh.face_material], None) for mesh in scene.meshes]
+    for part in (*bare, *rest):
+        mesh = part.mesh
+        for index in np.unique(mesh.face_material[part.faces]):
             material = scene.materials[index]
-            if material.fabric >= 0:
-                continue
-            faces = mesh.face_material == index
+            faces = part.faces & (mesh.face_material == index)
             look, said = _look(mi, material, None if mesh.uv is None else mesh.uv[faces], textures)
             warnings += said
-            for points, normals in _copies(mesh, faces):
+            for points, normals in _copies(mesh, faces, part.copy):
                 name = f"mesh{len(shapes)}"
                 file = folder / f"{name}.ply"
                 write_ply(file, space.points(points), normals, None if mesh.uv is None else mesh.uv[faces])
@@ -57,14 +63,14 @@ def surface_shapes(
     return shapes, list(dict.fromkeys(warnings))
 
 
-def _copies(mesh: Mesh, faces: NDArray[np.bool_]) -> list[tuple[Floats, Floats | None]]:
-    """World-space corners (T, 3, 3) of the chosen faces and their normals, once for each placement."""
+def _copies(mesh: Mesh, faces: NDArray[np.bool_], copy: int | None) -> list[tuple[Floats, Floats | None]]:
+    """World-space corners (T, 3, 3) of the chosen faces and their normals, for each placement or one of them."""
     points = mesh.points[mesh.triangles[faces]]
     normals = None if mesh.normals is None else mesh.normals[faces]
     if mesh.placements is None:
         return [(points, normals)]
     found = []
-    for matrix in mesh.placements:
+    for matrix in mesh.placements if copy is None else mesh.placements[copy : copy + 1]:
         linear = matrix[:, :3]
         placed = points @ linear.T + matrix[:, 3]
         turned = None if normals is None else normals @ np.linalg.inv(linear)
