@@ -151,8 +151,8 @@ def make_cloth(
                 remedy="use --backend embree, which needs no copies, or show less with --region or a closer camera",
             )
         warnings.append(
-            f"only the cloth in view and {MARGIN_CELLS} yarns around it are fibers; the rest is an opaque surface, so that "
-            "light from there and through it is only about right"
+            f"only the cloth in view and {MARGIN_CELLS} yarns around it are fibers; the rest is an opaque surface, "
+            "so that light from there and through it is only about right"
         )
     found: list[Fibers] = []
     rest: list[Rest] = []
