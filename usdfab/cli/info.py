@@ -1,26 +1,55 @@
-"""``usdfab info``: what a file holds."""
+"""``usdfab info``: what a file holds, or what this machine has."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import Parameter
 
 from usdfab.cli.options import Json, print_json
 
 
-def run(file: Path, /, *, json: Json = False) -> None:
-    """Print the fabrics of a USD file with all parameters and their units.
+def run(
+    file: Path | None = None,
+    /,
+    *,
+    system: Annotated[
+        bool, Parameter(negative="", help="What this machine has: LLVM, GPU, Embree, USD, memory, libraries.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Print the fabrics of a USD file with all parameters and their units, or what usdfab finds on this machine.
 
     Usage examples:
 
         usdfab info fabric.usda
         usdfab info cloth.usda --json
+        usdfab info --system
 
     Parameters
     ----------
     file:
         A USD file that holds at least one fabric.
     """
+    from usdfab.errors import UsdfabError
+
+    if system == (file is not None):
+        problem = "--system needs no file" if system else "no file is given"
+        raise UsdfabError(problem, place="info", remedy="write usdfab info FILE or usdfab info --system")
+    if file is not None:
+        _print_file(file, json)
+        return
+    from usdfab.cli.system import system_facts, system_lines
+
+    facts = system_facts()
+    if json:
+        print_json(facts)
+    else:
+        print("\n".join(system_lines(facts)))
+
+
+def _print_file(file: Path, json: bool) -> None:
     from usdfab.errors import UsdfabError
     from usdfab.fabric import as_table
     from usdfab.usd.colorways import colorways

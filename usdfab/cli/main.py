@@ -40,7 +40,7 @@ COMMANDS = {
     "new": "Write a new fabric from a preset, a weave or a weavers' draft.",
     "edit": "Change a fabric, mix two, or give one several colourways.",
     "draft": "Write a fabric as a weavers' draft, or draw its drawdown.",
-    "info": "Print the fabrics of a file with all parameters.",
+    "info": "Print the fabrics of a file with all parameters, or what this machine has.",
     "check": "Check a USD file against USD's validators and usdfab's rules.",
     "evaluate": "Judge usdfab's estimates on labelled photos.",
     "schema": "Print the folder of usdfab's USD schema, for PXR_PLUGINPATH_NAME.",

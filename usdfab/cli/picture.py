@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 from usdfab.errors import UsdfabError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from usdfab.tracer import Render
 
 
@@ -62,22 +65,37 @@ def picture_options(
 def write_picture(target: Path, render: Render, options: PictureOptions) -> None:
     """Write a render to its file."""
     from usdfab import imaging
-    from usdfab._version import __version__
     from usdfab.tracer.aovs import aov_layers
 
     pixels = render.pixels
     if options.denoise:
         pixels = imaging.denoise(pixels, render.albedo, render.normal)
+    layers = aov_layers(render, options.aovs) if options.aovs else None
+    write_pixels(target, pixels, render.region, render.size, options, layers)
+
+
+def write_pixels(
+    target: Path,
+    pixels: NDArray[np.float32],
+    region: tuple[int, int, int, int],
+    size: tuple[int, int],
+    options: PictureOptions,
+    layers: dict[str, NDArray] | None = None,
+) -> None:
+    """Write linear pixels (H, W, 3), the ``region`` of a picture of ``size``, to a file."""
+    from usdfab import imaging
+    from usdfab._version import __version__
+
     if target.suffix.lower() != ".exr":
         pixels = imaging.view_transform(pixels, options.exposure, options.view)
     imaging.write_image(
         target,
         pixels,
         overwrite=options.overwrite,
-        aovs=aov_layers(render, options.aovs) if options.aovs else None,
+        aovs=layers,
         metadata={"Software": f"usdfab {__version__}"},
-        offset=render.region[:2],
-        full_size=render.size,
+        offset=region[:2],
+        full_size=size,
     )
 
 
@@ -86,6 +104,7 @@ def render_facts(target: Path, render: Render) -> dict[str, Any]:
     height, width = render.pixels.shape[:2]
     return {
         "output": target,
+        "backend": "embree",
         "width": width,
         "height": height,
         "region": list(render.region),

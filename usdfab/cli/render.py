@@ -67,6 +67,12 @@ def run(
     scheduler: Annotated[
         str | None, Parameter(help="Dask scheduler tcp://HOST:PORT whose workers render, or local for processes here.")
     ] = None,
+    backend: Annotated[
+        str, Parameter(help="embree, or mitsuba: the same fibers in Mitsuba 3, for close-ups and small cloth.")
+    ] = "embree",
+    device: Annotated[
+        str | None, Parameter(help="With --backend mitsuba: auto (the default), llvm, cuda or scalar.")
+    ] = None,
     strict: Annotated[
         bool, Parameter(negative="", help="Stop at whatever is wrong with the stage instead of leaving it out.")
     ] = False,
@@ -87,6 +93,7 @@ def run(
         usdfab render fabric.usda -o swatch.png --resolution 720 --spp 256
         usdfab render samples/drape.usda --fabric fabric.usda -o drape.exr --resolution 1280x960 --noise 0.05
         usdfab render walk.usda -o walk.####.exr --frames 1-48 --aov depth,normal --scheduler tcp://farm:8786
+        usdfab render fabric.usda -o check.exr --backend mitsuba --resolution 256
 
     Parameters
     ----------
@@ -98,6 +105,18 @@ def run(
     from usdfab.cli.scene_source import SceneSource, frame_numbers
     from usdfab.errors import UsdfabError
 
+    if backend == "mitsuba":
+        refused = {
+            "--time": time, "--noise": noise, "--frames": frames, "--aov": aov, "--denoise": denoise, "--tile": tile,
+            "--checkpoint": checkpoint, "--resume": resume, "--workers": workers, "--scheduler": scheduler,
+        }  # fmt: skip
+        wrong = next((option for option, value in refused.items() if value is not None and value is not False), None)
+        if wrong:
+            raise UsdfabError("the Mitsuba backend has no such option", place=wrong, remedy="use --backend embree")
+    elif backend != "embree":
+        raise UsdfabError(f"there is no '{backend}'", place="--backend", remedy="choose embree or mitsuba")
+    elif device is not None:
+        raise UsdfabError("is for --backend mitsuba", place="--device")
     target = output or Path(stage.stem + ".png")
     options = picture_options(target, aov, denoise, exposure, view, overwrite)
     part = parse_tile(tile)
@@ -125,6 +144,14 @@ def run(
     def source(file: RenderFile) -> SceneSource:
         return SceneSource(str(stage.absolute()), names["fabric"], names["rig"], camera, file.time_code, strict)
 
+    if backend == "mitsuba":
+        from usdfab.cli.render_mitsuba import render_mitsuba
+
+        frame = FrameOptions(settings, window, options, resume, f"rendering {target.name}", quiet, json)
+        facts, warnings, worn = render_mitsuba(source(files[0]), files[0], frame, device or "auto", threads)
+        if json:
+            print_json(facts | {"outputs": [target], "fabric": worn, "warnings": warnings})
+        return
     results, warnings, worn = [], [], None
     place = "local" if scheduler is None and workers is not None else scheduler
     idle = place is None or all(file.finished for file in files)

@@ -134,6 +134,25 @@ def version() -> str:
     return f"{number // 10000}.{number // 100 % 100}.{number % 100}"
 
 
+_FEATURES = {
+    "packets of 4": 32,
+    "packets of 8": 33,
+    "packets of 16": 34,
+    "ray mask": 64,
+    "filter functions": 66,
+    "triangles": 96,
+    "curves": 99,
+    "back-face culling of curves": 63,
+    "parallel commit": 130,
+}
+"""Device properties that tell what a build of Embree, on this processor, can do."""
+
+
+def features() -> dict[str, bool]:
+    """What this build of Embree can do on this processor."""
+    return {name: bool(library().rtcGetDeviceProperty(device(), number)) for name, number in _FEATURES.items()}
+
+
 @_once
 def function_addresses() -> tuple[int, int]:
     """Addresses of ``rtcIntersect1`` and ``rtcOccluded1`` for compiled kernels."""

@@ -20,6 +20,12 @@ YARN_API = "UsdfabYarnAPI"
 """Multiple-apply schema on a Material, instances ``warp`` and ``weft``: one yarn system each."""
 
 
+def usd_version() -> str:
+    """Version of the USD library that runs here, for example ``"26.11"``; not always that of the package."""
+    _, minor, patch = Usd.GetVersion()
+    return f"{minor}.{patch:02d}"
+
+
 def register() -> None:
     """Make the schema known to USD. Harmless when repeated, and when PXR_PLUGINPATH_NAME has it already."""
     # A copy that the host put on PXR_PLUGINPATH_NAME wins: two copies of one type would be an error in the host.
