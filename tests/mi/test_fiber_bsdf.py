@@ -467,7 +467,7 @@ def test_gradients_of_samples():
     mean, error = np.mean(estimates, axis=0), np.std(estimates, axis=0, ddof=1) / math.sqrt(12)
     print("gradients by samples", mean, "+-", error, "by quadrature", np.array(expected))
     assert np.all(abs(mean - expected) < 5.0 * error)
-    assert np.all(error < 0.1 * np.abs(expected) + 2e-3)
+    assert np.all(error < [0.02, 0.05, 0.02, 0.02, 1e-3, 1e-3, 1e-2])
 
 
 @pytest.mark.parametrize("albedo", [(1.0, 1.0, 1.0), (1e-30, 1e-6, 1.0)])
@@ -581,7 +581,8 @@ def test_gradients_of_a_render(tmp_path):
 
     mi.register_bsdf("fixed_sampling", fixed_sampling_class())
     description["fibers"]["bsdf"] = {"type": "fixed_sampling", "value_of": bsdf, "samples_of": bsdf}
-    scene = mi.load_dict(description)
+    # Without "optimize", which would make one object of the two equal ones.
+    scene = mi.load_dict(description, optimize=False)
     params = mi.traverse(scene)
     ratios = {}
     for name in names:
@@ -599,4 +600,68 @@ def test_gradients_of_a_render(tmp_path):
             params[key] = kind(start)
             ratios[f"{name} {channel}"] = float(got[name][channel] * 8e-3 / (means[0] - means[1]))
     print({name: f"{value - 1:.1e}" for name, value in ratios.items()})
-    assert all(abs(value - 1.0) < 0.01 for value in ratios.values()), ratios
+    assert all(abs(value - 1.0) < 5e-3 for value in ratios.values()), ratios
+
+
+# --- A color for each curve ---
+
+
+def test_curve_colors(tmp_path):
+    """A hit sees the color of its own curve; the gradient goes there too."""
+    from usdfab.mi.curve_color import curve_of_segment, register_curve_color
+
+    register_curve_color()
+    colors = np.array([[0.9, 0.1, 0.1], [0.1, 0.9, 0.1], [0.2, 0.2, 0.95]])
+    texture = {
+        "type": "usdfab_curve_color",
+        "colors": mi.TensorXf(colors),
+        "curve_of_segment": mi.TensorXu(curve_of_segment([9, 9, 9])),
+    }
+    scene = mi.load_dict(bundle(tmp_path, {"type": "usdfab_fiber", "albedo": texture}, curves=3))
+    params = mi.traverse(scene)
+    key = "fibers.bsdf.albedo.colors"
+    dr.enable_grad(params[key])
+    params.update()
+    rng = np.random.default_rng(23)
+    n = 300
+    # From straight above onto the middle of each of the three fibers.
+    curve = rng.integers(0, 3, n)
+    y = rng.uniform(-4.0, 4.0, n)
+    x = 0.9 * (curve - 1) + 0.1 * np.sin(y + curve)
+    ray = mi.Ray3f(mi.Point3f(x, y, np.full(n, 20.0)), mi.Vector3f(0.0, 0.0, -1.0))
+    si = scene.ray_intersect(ray)
+    wi = mi.Vector3f(directions(rng, n))
+    value = si.bsdf().eval(mi.BSDFContext(), si, wi)
+    one = [plugin(Fiber(0.5, 0.1, 0.12, tuple(color))).eval(mi.BSDFContext(), si, wi) for color in colors]
+    expected = np.choose(curve, [np.array(v) for v in one])
+    np.testing.assert_allclose(np.array(value), expected, rtol=1e-5, atol=1e-7)
+    first = mi.Bool(curve == 1)
+    dr.backward(dr.sum(dr.select(first, value.x + value.y + value.z, 0.0)))
+    gradient = np.array(dr.grad(params[key])).reshape(3, 3)
+    assert np.all(gradient[1] > 0.0) and np.all(gradient[[0, 2]] == 0.0)
+
+
+def test_curve_colors_refuse():
+    from usdfab.mi import curve_color
+
+    for counts in ([3], [[5]]):
+        with pytest.raises(UsdfabError, match="four control points"):
+            curve_color.curve_of_segment(counts)
+    for colors, segments, place in (
+        (np.ones((2, 2)), [0], "colors"),
+        (np.zeros((2, 3)), [0], "colors"),
+        (np.ones((2, 3)), [2], "curve_of_segment"),
+    ):
+        props = mi.Properties("usdfab_curve_color")
+        props["colors"], props["curve_of_segment"] = mi.TensorXf(colors), mi.TensorXu(np.array(segments))
+        with pytest.raises(UsdfabError, match=f"^{place}: "):
+            curve_color._plugin_class()(props)
+
+
+def test_registering_again_is_harmless():
+    from usdfab.mi.curve_color import register_curve_color
+    from usdfab.mi.fiber_bsdf import register_fiber_bsdf
+
+    for _ in range(2):
+        register_curve_color()
+        register_fiber_bsdf()

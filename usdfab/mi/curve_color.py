@@ -2,7 +2,8 @@
 
     register_curve_color()                                    # once, after mi.set_variant
     mi.load_dict({"type": "bsplinecurve", "filename": "warp.txt", "bsdf": {"type": "usdfab_fiber", "albedo": {
-        "type": "usdfab_curve_color", "colors": colors, "curve_of_segment": curve_of_segment([12, 12, 9])}}})
+        "type": "usdfab_curve_color", "colors": mi.TensorXf(colors),
+        "curve_of_segment": mi.TensorXu(curve_of_segment([12, 12, 9]))}}})
 
 Mitsuba's curves have no attributes of their own, but a hit knows its segment (`si.prim_index`), and segments are counted
 through the curves of a file one after the other. A color is not interpolated; parameter: `colors`, (3 n) float.
