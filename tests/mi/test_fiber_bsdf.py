@@ -82,7 +82,10 @@ def hit(wi: np.ndarray):
 
 def sampled(bsdf, si, rng, n: int):
     return bsdf.sample(
-        mi.BSDFContext(), si, mi.Float(rng.random(n, dtype=np.float32)), mi.Point2f(rng.random((2, n), dtype=np.float32))
+        mi.BSDFContext(),
+        si,
+        mi.Float(rng.random(n, dtype=np.float32)),
+        mi.Point2f(rng.random((2, n), dtype=np.float32)),
     )
 
 
@@ -229,7 +232,7 @@ def test_formulas_against_numba(tilt):
 
 @pytest.mark.parametrize(("low", "tolerance"), [(0.05, 1e-4), (0.01, 6e-4)])
 def test_plugin_against_numba(low, tolerance):
-    """The plugin computes in float32, whose angles have a step of 1e-7: in a lobe of width 0.0017, 10 widths out, 5e-4."""
+    """The plugin computes in float32, whose angles have a step of 2e-7: at gamma_N = 0.01 that is 1e-4 of a width."""
     rng = np.random.default_rng(5)
     n = 6_000
     values = random_materials(rng, n, low)
@@ -343,7 +346,8 @@ def test_samples(fiber):
     np.testing.assert_allclose(
         np.array(weight) * np.array(pdf), np.array(value), rtol=2e-4 if rough else 5e-3, atol=1e-6
     )
-    assert 0.0 <= np.array(weight).min() and np.array(weight).max() < 3.0 + 1e-5
+    assert np.array(weight).min() >= 0.0
+    assert np.array(weight).max() < 3.0 + 1e-5
     assert np.array(sample.pdf).min() > 0.0
     white = sampled(plugin(fiber._replace(albedo=(1.0, 1.0, 1.0))), si, rng, n)[1]
     np.testing.assert_allclose(np.array(white), 1.0, rtol=2e-6)
@@ -392,7 +396,9 @@ def test_chi_square_sees_a_wrong_density():
 # --- Gradients ---
 
 
-@pytest.mark.parametrize("fiber", [Fiber(0.5, 0.1, 0.12, (0.9, 0.5, 0.1)), Fiber(0.2, 0.4, 0.3, (0.3, 0.6, 0.95), 1.4, 0.1)])
+@pytest.mark.parametrize(
+    "fiber", [Fiber(0.5, 0.1, 0.12, (0.9, 0.5, 0.1)), Fiber(0.2, 0.4, 0.3, (0.3, 0.6, 0.95), 1.4, 0.1)]
+)
 def test_gradients_of_eval(fiber):
     """Every derivative of a weighted sum of values, in reverse mode, against differences of the Numba target."""
     rng = np.random.default_rng(13)
@@ -402,8 +408,8 @@ def test_gradients_of_eval(fiber):
     si = hit(wo)
     wi = np.array(sampled(bsdf, si, rng, n)[0].wo)
     params = mi.traverse(bsdf)
-    for key in params.keys():
-        dr.enable_grad(params[key])
+    for _, value in params:
+        dr.enable_grad(value)
     params.update()
     value = bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(wi))
     dr.backward(dr.sum(value * mi.Color3f(coefficients), axis=None))
@@ -433,7 +439,7 @@ def test_gradients_of_eval(fiber):
 
 
 def test_gradients_of_samples():
-    """Sampling is detached: the mean weight times light has the derivative of reflected light, by quadrature in Numba."""
+    """Sampling is detached: mean weight times light has the derivative of the integral, by quadrature in Numba."""
     fiber = Fiber(0.5, 0.3, 0.4, (0.9, 0.5, 0.1))
     h, theta_o = 0.4, 0.3
     bsdf = plugin(fiber)
@@ -478,7 +484,9 @@ def test_gradients_are_finite(albedo, gamma, eta, tilt):
     """Along the axis, at |h| = 1, exactly opposite, in the mirror direction: values and all gradients are numbers."""
     corners = [
         np.array(w, dtype=np.float32) / np.linalg.norm(w).astype(np.float32)
-        for w in itertools.product((-1.0, -1e-4, 0.0, 1e-20, 1.0), (-1.0, 0.0, 1e-8, 1.0), (-1.0, 0.0, 1e-20, 1e-4, 1.0))
+        for w in itertools.product(
+            (-1.0, -1e-4, 0.0, 1e-20, 1.0), (-1.0, 0.0, 1e-8, 1.0), (-1.0, 0.0, 1e-20, 1e-4, 1.0)
+        )
         if any(abs(x) == 1.0 for x in w)
     ]
     pairs = np.array(list(itertools.product(corners, corners)), dtype=np.float32)
@@ -486,7 +494,7 @@ def test_gradients_are_finite(albedo, gamma, eta, tilt):
     params = mi.traverse(bsdf)
     si = hit(np.ascontiguousarray(pairs[:, 0].T))
     wi = mi.Vector3f(np.ascontiguousarray(pairs[:, 1].T))
-    inputs = [params[key] for key in params.keys()] + [si.wi, wi]
+    inputs = [value for _, value in params] + [si.wi, wi]
     for one in inputs:
         dr.enable_grad(one)
     params.update()

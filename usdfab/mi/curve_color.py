@@ -5,8 +5,8 @@
         "type": "usdfab_curve_color", "colors": mi.TensorXf(colors),
         "curve_of_segment": mi.TensorXu(curve_of_segment([12, 12, 9]))}}})
 
-Mitsuba's curves have no attributes of their own, but a hit knows its segment (`si.prim_index`), and segments are counted
-through the curves of a file one after the other. A color is not interpolated; parameter: `colors`, (3 n) float.
+Mitsuba's curves have no attributes of their own, but a hit knows its segment (`si.prim_index`), and segments are
+counted through the curves of a file one after the other. A color is not interpolated; parameter: `colors`, (3 n) float.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def register_curve_color() -> None:
 def _plugin_class() -> type:
     """The texture for the variant that is set."""
 
-    class CurveColor(mi.Texture):  # type: ignore[misc, name-defined]
+    class CurveColor(mi.Texture):
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             colors = np.array(props["colors"], dtype=np.float32)

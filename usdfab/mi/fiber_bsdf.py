@@ -84,7 +84,7 @@ def _number(props: Any, name: str, default: float, low: float, high: float, clos
 
 def _color(props: Any) -> Any:
     """The property `albedo`: a texture, or three floats in (0, 1]."""
-    value = props["albedo"] if "albedo" in props else 0.5
+    value = props.get("albedo", 0.5)
     if isinstance(value, mi.Texture):
         return value
     color = [float(value)] * 3 if isinstance(value, (int, float)) else [float(value[k]) for k in range(3)]
@@ -96,7 +96,7 @@ def _color(props: Any) -> Any:
 def _plugin_class() -> type:
     """The plugin for the variant that is set; `mi.BSDF` is another class in each."""
 
-    class FiberBSDF(mi.BSDF):  # type: ignore[misc, name-defined]
+    class FiberBSDF(mi.BSDF):
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             self.albedo = _color(props)
