@@ -43,6 +43,19 @@ MAX_COLORS = 128
 """Most different colours of fibers, each of which is a BSDF of its own; beyond that they are rounded."""
 
 
+def plugin_bsdf(yarn: YarnParameters, albedo: Floats) -> dict[str, Any]:
+    """Our own fiber BSDF (``usdfab.mi.fiber_bsdf``, to be registered before), the same as the tracer's."""
+    return {
+        "type": "usdfab_fiber",
+        "albedo": {"type": "rgb", "value": np.maximum(albedo, 1e-4).tolist()},
+        "gamma_m": yarn.roughness_longitudinal,
+        "gamma_n": yarn.roughness_azimuthal,
+        "gamma_m0": yarn.roughness_primary,
+        "eta": yarn.ior,
+        "tilt": yarn.cuticle_tilt,
+    }
+
+
 def hair_bsdf(yarn: YarnParameters, albedo: Floats) -> dict[str, Any]:
     """Mitsuba's own hair BSDF. It has one longitudinal roughness and no cuticle: see ``hair_warnings``."""
     return {

@@ -14,13 +14,16 @@ from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.mi.camera import Window
-from usdfab.mi.fibers import MAX_POINTS, FiberBsdf, TextureReader
+from usdfab.mi.fibers import MAX_POINTS, FiberBsdf, TextureReader, plugin_bsdf
 from usdfab.mi.scene import translate
 from usdfab.mi.variant import load, resolve_device
 from usdfab.usd.scene import Camera, Scene
 
 PATHS_AT_ONCE = 2_000_000
 """Most paths in a pass: each takes some hundred bytes in the compiled variants."""
+
+DIFFERENTIABLE = ("llvm_ad_rgb", "cuda_ad_rgb")
+"""Variants in which our own fiber BSDF runs."""
 
 FEWEST_PASSES = 4
 """Passes tell the noise; fewer would tell too little of it."""
@@ -78,7 +81,8 @@ def render(
     Parameters
     ----------
     pictures, textures, fiber_bsdf:
-        As ``usdfab.mi.scene.translate``.
+        As ``usdfab.mi.scene.translate``; without ``fiber_bsdf`` our own plugin where the variant can have it (not
+        ``scalar``), else Mitsuba's hair.
     progress:
         Called with (passes done, passes).
 
@@ -91,6 +95,11 @@ def render(
         raise UsdfabError(f"spp {settings.spp} and depth {settings.max_depth} must be at least 1")
     device = resolve_device(settings.device)
     mi = load(device)
+    if fiber_bsdf is None and mi.variant() in DIFFERENTIABLE:
+        from usdfab.mi.fiber_bsdf import register_fiber_bsdf
+
+        register_fiber_bsdf()
+        fiber_bsdf = plugin_bsdf
     if settings.threads is not None:
         import drjit
 

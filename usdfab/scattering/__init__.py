@@ -1,5 +1,6 @@
 """How a single textile fiber scatters light: the near-field fiber BSDF of Chiang et al. (2015).
 
-`roughness` holds the plain NumPy maps from perceptual parameters to those of the lobes, `fiber_numba` the BSDF itself
-as Numba functions of scalars. This file imports neither: Numba is loaded by those who shade.
+`roughness` holds the plain NumPy maps from perceptual parameters to those of the lobes; the BSDF itself is written once
+for each target, side by side and held together by tests: `fiber_numba` as Numba functions of scalars, `fiber_drjit` for
+arrays of Dr.Jit, which differentiates them. This file imports none: Numba and Dr.Jit are loaded by those who shade.
 """
