@@ -71,7 +71,7 @@ def measure(plugin: str, side: int, spp: int, runs: int, fibers: int, variant: s
     dr.set_log_level(dr.LogLevel.Error)
     cloth = scenes.fabric(fibers=fibers)
     with tempfile.TemporaryDirectory() as folder:
-        scene = mi.load_dict(description(mi, cloth, side, plugin, Path(folder)))
+        scene = mi.load_dict(description(mi, cloth, side, plugin, Path(folder)), parallel=False)
     dr.sync_thread()
 
     def timed(function) -> list[float]:

@@ -149,6 +149,31 @@ def test_refuses(properties, place):
         fiber_bsdf._plugin_class()(props)
 
 
+def test_what_was_refused_does_not_spoil_a_render():
+    """Dr.Jit calls every object that exists, and errors keep theirs alive."""
+    from usdfab.mi import curve_color, fiber_bsdf
+
+    bad = mi.Properties("usdfab_fiber")
+    bad["eta"] = 1.0
+    colors = mi.Properties("usdfab_curve_color")
+    colors["colors"], colors["curve_of_segment"] = mi.TensorXf(np.zeros((2, 3))), mi.TensorXu(np.array([0]))
+    refused = []
+    for make, props in ((fiber_bsdf._plugin_class(), bad), (curve_color._plugin_class(), colors)):
+        try:
+            make(props)
+        except UsdfabError as error:
+            refused.append(error)
+    assert len(refused) == 2
+    balls = {
+        f"ball{k}": {"type": "sphere", "center": [k, 0, 3], "bsdf": {"type": "usdfab_fiber", "gamma_m": gamma}}
+        for k, gamma in enumerate((0.3, 0.5))
+    }
+    film = {"type": "hdrfilm", "width": 4, "height": 4}
+    scene = {"type": "scene", "sky": {"type": "constant"}, "sensor": {"type": "perspective", "film": film}, **balls}
+    picture = mi.render(mi.load_dict(scene, parallel=False), integrator=mi.load_dict({"type": "path", "max_depth": 3}))
+    assert np.all(np.isfinite(np.array(picture))) and np.array(picture).mean() > 0.1
+
+
 def test_refuses_a_scalar_variant():
     from usdfab.mi.fiber_bsdf import register_fiber_bsdf
 
@@ -577,7 +602,7 @@ def test_gradients_of_a_render(tmp_path):
     names = ("albedo", *NUMBERS)
     description = bundle(tmp_path, bsdf)
     description["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": [0.3, 0.2, 0.1]}}
-    scene = mi.load_dict(description)
+    scene = mi.load_dict(description, parallel=False)
     integrator = mi.load_dict({"type": "prb", "max_depth": 4, "rr_depth": 100})
     params = mi.traverse(scene)
     for name in names:
@@ -590,7 +615,7 @@ def test_gradients_of_a_render(tmp_path):
     mi.register_bsdf("fixed_sampling", fixed_sampling_class())
     description["fibers"]["bsdf"] = {"type": "fixed_sampling", "value_of": bsdf, "samples_of": bsdf}
     # Without "optimize", which would make one object of the two equal ones.
-    scene = mi.load_dict(description, optimize=False)
+    scene = mi.load_dict(description, parallel=False, optimize=False)
     params = mi.traverse(scene)
     ratios = {}
     for name in names:
@@ -625,7 +650,7 @@ def test_curve_colors(tmp_path):
         "colors": mi.TensorXf(colors),
         "curve_of_segment": mi.TensorXu(curve_of_segment([9, 9, 9])),
     }
-    scene = mi.load_dict(bundle(tmp_path, {"type": "usdfab_fiber", "albedo": texture}, curves=3))
+    scene = mi.load_dict(bundle(tmp_path, {"type": "usdfab_fiber", "albedo": texture}, curves=3), parallel=False)
     params = mi.traverse(scene)
     key = "fibers.bsdf.albedo.colors"
     dr.enable_grad(params[key])

@@ -46,7 +46,7 @@ def compare(cloth, depth: int, spp: int, tolerance: float, folder: Path) -> None
             "gamma_m0": yarn.roughness_primary,
             "eta": yarn.ior,
         }
-    theirs = mi.load_dict(description)
+    theirs = mi.load_dict(description, parallel=False)
     means = [np.array(mi.render(theirs, spp=spp // RUNS, seed=k)).mean(axis=(0, 1), dtype=float) for k in range(RUNS)]
     mean, error = np.mean(means, axis=0), np.std(means, axis=0, ddof=1) / np.sqrt(RUNS)
     ours = Tracer(scene).render(camera, RenderSettings((SIDE, SIDE), spp=spp, max_depth=depth))

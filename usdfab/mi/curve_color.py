@@ -55,7 +55,7 @@ def _plugin_class() -> type:
 
     class CurveColor(mi.Texture):
         def __init__(self, props: Any) -> None:
-            super().__init__(props)
+            # Checked before there is an object, as in ``fiber_bsdf``.
             colors = np.array(props["colors"], dtype=np.float32)
             segments = np.array(props["curve_of_segment"], dtype=np.uint32)
             if colors.ndim != 2 or colors.shape[1] != 3:
@@ -64,6 +64,7 @@ def _plugin_class() -> type:
                 raise UsdfabError("expected values in (0, 1]", place="colors")
             if segments.ndim != 1 or segments.size == 0 or segments.max() >= len(colors):
                 raise UsdfabError(f"expected numbers of {len(colors)} curves", place="curve_of_segment")
+            super().__init__(props)
             self.colors = mi.Float(colors.ravel())
             self.segments = mi.UInt32(segments)
 

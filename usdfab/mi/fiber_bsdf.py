@@ -20,6 +20,9 @@ An rgb color is the parameter `albedo`; a texture (a color for each curve: `usdf
 attributes and uv give) keeps its own parameters below `albedo.`. As in all of Mitsuba, `params.update()` after
 `dr.enable_grad` or a new value: what follows from the parameters is computed there, once.
 
+Load scenes that hold it with ``mi.load_dict(..., parallel=False)``: plugins written in Python trace Dr.Jit code when
+they are made, which several threads must not do at once.
+
 The formulas, and how they differ from Mitsuba's `hair`, are in `usdfab.scattering.fiber_drjit`. The shading frame has t
 along the fiber: `bsplinecurve`, not `linearcurve`, which has no tangent. Sampling is detached, so that the weight
 carries the derivative of the value alone: unbiased with every integrator.
@@ -98,12 +101,15 @@ def _plugin_class() -> type:
 
     class FiberBSDF(mi.BSDF):
         def __init__(self, props: Any) -> None:
+            # Checked before there is an object: Dr.Jit traces every one there is, also one that an error left half made.
+            albedo = _color(props)
+            roughness = {name: _number(props, name, default, 0.01, 1.0) for name, default in _ROUGHNESS.items()}
+            eta = _number(props, "eta", 1.55, 1.0, math.inf, closed=False)
+            tilt = _number(props, "tilt", 0.0, -math.pi / 8, math.pi / 8)
             super().__init__(props)
-            self.albedo = _color(props)
-            for name, default in _ROUGHNESS.items():
-                setattr(self, name, mi.Float(_number(props, name, default, 0.01, 1.0)))
-            self.eta = mi.Float(_number(props, "eta", 1.55, 1.0, math.inf, closed=False))
-            self.tilt = _number(props, "tilt", 0.0, -math.pi / 8, math.pi / 8)
+            self.albedo, self.eta, self.tilt = albedo, mi.Float(eta), tilt
+            for name, value in roughness.items():
+                setattr(self, name, mi.Float(value))
             flags = mi.BSDFFlags
             self.m_components = [
                 flags.GlossyReflection | flags.GlossyTransmission | flags.FrontSide | flags.BackSide

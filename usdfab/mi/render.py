@@ -109,7 +109,8 @@ def render(
             mi, scene, camera, settings.size, settings.region, Path(folder), max_depth=settings.max_depth,
             pictures=pictures, textures=textures, fiber_bsdf=fiber_bsdf, budget=settings.budget,
         )  # fmt: skip
-        loaded = mi.load_dict(translation.description)
+        # Plugins written in Python trace Dr.Jit code when they are made: not in several threads at once.
+        loaded = mi.load_dict(translation.description, parallel=False)
     x0, y0, x1, y1 = settings.region
     counts = passes(settings.spp, (x1 - x0) * (y1 - y0))
     total, squares = np.zeros((y1 - y0, x1 - x0, 3)), np.zeros((y1 - y0, x1 - x0, 3))
