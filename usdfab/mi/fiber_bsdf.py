@@ -101,7 +101,7 @@ def _plugin_class() -> type:
 
     class FiberBSDF(mi.BSDF):
         def __init__(self, props: Any) -> None:
-            # Checked before there is an object: Dr.Jit traces every one there is, also one that an error left half made.
+            # Checked before there is an object: Dr.Jit traces all that exist, also those that an error left half made.
             albedo = _color(props)
             roughness = {name: _number(props, name, default, 0.01, 1.0) for name, default in _ROUGHNESS.items()}
             eta = _number(props, "eta", 1.55, 1.0, math.inf, closed=False)
