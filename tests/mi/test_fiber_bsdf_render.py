@@ -20,7 +20,7 @@ from scenes import fabric, swatch
 
 from usdfab.fibers import generate_patch
 from usdfab.mi.fiber_bsdf import register_fiber_bsdf
-from usdfab.tracer import RenderSettings, Tracer
+from usdfab.tracer import RenderSettings, Tracer, patch_scene
 from usdfab.tracer.patch_scene import tile_copies
 
 SIDE = 16
@@ -63,6 +63,10 @@ def test_mean(tmp_path):
 
 
 @pytest.mark.slow
-def test_mean_of_satin_with_narrow_lobes(tmp_path):
-    """Where Mitsuba's `hair` is 2 to 3 % too bright: its samples of the last lobe do not follow its density."""
+def test_mean_of_satin_with_narrow_lobes(tmp_path, monkeypatch):
+    """Where Mitsuba's `hair` is 2 to 3 % too bright: its samples of the last lobe do not follow its density.
+
+    With all knots of the splines: without those that the tracer leaves out these few thick fibers are 1.3 % darker.
+    """
+    monkeypatch.setattr(patch_scene, "BEND", 1e-9)
     compare(fabric("satin", fibers=8, roughness_azimuthal=0.1), 64, 65536, 0.006, tmp_path)
