@@ -197,7 +197,7 @@ def showroom(
     instancer.CreateProtoIndicesAttr([0, 0, 0, 0])
 
     x, y = cell(2, 1)
-    half = 0.45 * CELL
+    half = 0.4 * CELL
     cube = [
         (x + half * (2 * i - 1), y + half * (2 * j - 1), half * (2 * k - 1))
         for k in (0, 1)
