@@ -98,7 +98,7 @@ def with_optics(fabric: FabricParameters, optics: Optics) -> FabricParameters:
         new: dict[Color, Color] = {}
         for row in rows:
             red, green, blue = optics.albedo[row].tolist()
-            new[tuple(old.albedo[row].tolist())] = (red, green, blue)  # type: ignore[index]
+            new[tuple(old.albedo[row].tolist())] = (red, green, blue)
         values: dict = dict(zip(ROUGHNESSES, optics.roughness[index].tolist(), strict=True))
         if yarn.yarn_albedo:
             values["yarn_albedo"] = tuple(new[c] for c in yarn.yarn_albedo)
