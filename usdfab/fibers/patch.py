@@ -160,7 +160,7 @@ def generate_patch(
     UsdfabError
         If the repeat is too large for memory (``budget.MAX_PATCH_POINTS``).
     """
-    return _patch(_yarn_systems(fabric, vertices_per_segment, copies), variant)
+    return _patch(yarn_systems(fabric, vertices_per_segment, copies), variant)
 
 
 def patch_variants(
@@ -176,15 +176,18 @@ def patch_variants(
     """
     if count is None:
         count = affordable_variants(fabric, vertices_per_segment, copies)
-    systems = _yarn_systems(fabric, vertices_per_segment, copies, count)
+    systems = yarn_systems(fabric, vertices_per_segment, copies, count)
     patches = [_patch(systems, variant) for variant in range(count)]
     low, high = min(p.z_range[0] for p in patches), max(p.z_range[1] for p in patches)
     return [replace(p, z_bounds=(low, high)) for p in patches]
 
 
 @dataclass(frozen=True)
-class _YarnSystem:
-    """What all variants of one yarn system have in common. ``size`` (2,) metres is the patch's."""
+class YarnSystem:
+    """What all variants of one yarn system have in common. ``size`` (2,) metres is the patch's.
+
+    ``along_cell`` and ``across_cell`` are the sides of a cell along and across the yarns, metres.
+    """
 
     name: System
     yarn: YarnParameters
@@ -264,9 +267,10 @@ class _YarnSystem:
         return np.stack([first, second, height], axis=-1)
 
 
-def _yarn_systems(
+def yarn_systems(
     fabric: FabricParameters, vertices_per_segment: int, copies: tuple[int, int], variants: int = 1
-) -> tuple[_YarnSystem, _YarnSystem]:
+) -> tuple[YarnSystem, YarnSystem]:
+    """(warp, weft) of a patch, before any fiber is made; parameters and errors as ``patch_variants``."""
     if vertices_per_segment < 4:
         raise UsdfabError(f"{vertices_per_segment} vertices per segment are too few, at least 4 are needed")
     check_points(fabric, vertices_per_segment, copies, variants)
@@ -275,7 +279,7 @@ def _yarn_systems(
     weave = fabric.weave.tiled(picks // fabric.weave.picks, ends // fabric.weave.ends)
     dx, dy = fabric.cell
 
-    def system(name: System) -> _YarnSystem:
+    def system(name: System) -> YarnSystem:
         yarn = fabric.system(name)
         layout = lay_out(weave, name, vertices_per_segment)
         draws = draw(layout, yarn.fiber_count, fabric.seed, yarn.ply_count)
@@ -283,12 +287,12 @@ def _yarn_systems(
         cells = (dx, dy) if name == "weft" else (dy, dx)
         vertices = max(MIN_FLYAWAY_VERTICES, round(FLYAWAY_VERTICES * vertices_per_segment))
         size = (ends * dx, picks * dy)
-        return _YarnSystem(name, yarn, layout, draws, successor, *cells, size, fabric.seed, vertices)
+        return YarnSystem(name, yarn, layout, draws, successor, *cells, size, fabric.seed, vertices)
 
     return system("warp"), system("weft")
 
 
-def _patch(systems: tuple[_YarnSystem, _YarnSystem], variant: int) -> Patch:
+def _patch(systems: tuple[YarnSystem, YarnSystem], variant: int) -> Patch:
     if variant < 0:
         raise ValueError(f"variants are numbered from 0, not {variant}")
     warp, weft = (s.fibers(variant) for s in systems)

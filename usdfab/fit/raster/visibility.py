@@ -1,0 +1,183 @@
+"""What each pixel sees and what shadows it: Embree on the patch, which repeats for ever, in one Numba kernel.
+
+Fibers are round segments: from the camera a round segment looks exactly like a ribbon that faces it, and unlike a
+ribbon it has the right surface for shadow rays. Nothing here has gradients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from usdfab.fit.raster.curves import CurveModel
+from usdfab.tracer import embree
+from usdfab.tracer.embree import NEIGHBOR_LEFT, NEIGHBOR_RIGHT, EmbreeScene, curve_scene
+from usdfab.tracer.intrinsics import KERNEL, PRIM, filter_address, new_ray_buffer
+from usdfab.tracer.patch_scene import FIBER_RADIUS_UNITS
+from usdfab.tracer.slab import HIT, trace_slab
+from usdfab.tracer.world import EPSILON, HEIGHT, HIGH, LOW, PATCH_COLUMNS, UNITS, WIDTH
+
+NOTHING = -1
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What rays met, (N,) each: the segment (the number of its first vertex) or ``NOTHING``, and its copy (N, 2).
+
+    A copy (i, j) is shifted by i and j times the patch's size.
+    """
+
+    segment: NDArray[np.int32]
+    copy: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class PatchIndex:
+    """A patch ready for rays. ``table`` (1, PATCH_COLUMNS) as of the tracer; lengths in its units.
+
+    ``segment`` and ``copy`` tell which segment, shifted by how many patches, an Embree primitive is.
+    """
+
+    scene: EmbreeScene
+    table: NDArray[np.float64]
+    segment: NDArray[np.int32]
+    copy: NDArray[np.int32]
+
+    @property
+    def units(self) -> float:
+        """Units per metre."""
+        return float(self.table[0, UNITS])
+
+
+def index_patch(model: CurveModel, points: NDArray[np.float64], radius: NDArray[np.float64]) -> PatchIndex:
+    """All segments that overlap the patch, copies from its neighbours included, as an Embree scene.
+
+    Parameters
+    ----------
+    points: (V, 3), radius: (2,)
+        Values of ``Polylines``, metres.
+    """
+    units = FIBER_RADIUS_UNITS / float(radius.min())
+    points = units * points
+    period = units * np.array(model.size)
+    thick = units * radius[model.system]
+    pad = np.zeros((len(points), 1))
+    ends = points[model.following] + np.c_[model.following_shift * period, pad]
+    reach = thick[:, None]
+    low = np.minimum(points, ends)[:, :2] - reach
+    high = np.maximum(points, ends)[:, :2] + reach
+    # Copy k shows x + k * period: it overlaps [0, period) where -high < k * period < period - low.
+    first = np.floor(-high / period).astype(np.int64) + 1
+    last = np.ceil(1.0 - low / period).astype(np.int64) - 1
+    count = np.prod(np.maximum(last - first + 1, 0), axis=1)
+    segment = np.repeat(np.arange(len(points)), count)
+    place = np.arange(len(segment)) - np.repeat(np.cumsum(count) - count, count)
+    wide = (last - first + 1)[segment, 0]
+    copy = first[segment] + np.c_[place % wide, place // wide]
+
+    # Each segment brings its own four vertices: the one before, its two, the one after.
+    shift = np.c_[copy * period, np.zeros(len(copy))]
+    before, after = model.preceding[segment], model.following[segment]
+    beyond = model.following[after]
+    back = np.c_[model.preceding_shift[segment] * period, np.zeros(len(copy))]
+    on = np.c_[model.following_shift[segment] * period, np.zeros(len(copy))]
+    further = on + np.c_[model.following_shift[after] * period, np.zeros(len(copy))]
+    vertices = np.stack([points[before] + back, points[segment], points[after] + on, points[beyond] + further], axis=1)
+    vertices += shift[:, None, :]
+    thickness = np.broadcast_to(thick[segment][:, None, None], (len(segment), 4, 1))
+    # A neighbour that does not overlap the patch draws no joint: then this segment does.
+    key = (copy[:, 0] + 64) * 128 + copy[:, 1] + 64
+    own = segment * 16384 + key
+    known = np.sort(own)
+
+    def overlaps(other: NDArray[np.int64], wraps: NDArray[np.int64]) -> NDArray[np.bool_]:
+        moved = copy + wraps
+        wanted = other * 16384 + (moved[:, 0] + 64) * 128 + moved[:, 1] + 64
+        where = np.minimum(np.searchsorted(known, wanted), len(known) - 1)
+        return known[where] == wanted
+
+    flags = NEIGHBOR_LEFT * overlaps(before, model.preceding_shift[segment])
+    flags = flags + NEIGHBOR_RIGHT * overlaps(after, model.following_shift[segment])
+    scene = curve_scene(
+        np.concatenate([vertices, thickness], axis=2).reshape(-1, 4),
+        4 * np.arange(len(segment)) + 1,
+        flags.astype(np.uint8),
+    )
+    bottom = float((np.minimum(points[:, 2], ends[:, 2]) - thick).min())
+    top = float((np.maximum(points[:, 2], ends[:, 2]) + thick).max())
+    table = np.zeros((1, PATCH_COLUMNS))
+    table[0, [WIDTH, HEIGHT]] = period
+    table[0, [LOW, HIGH]] = bottom - 1e-3 * FIBER_RADIUS_UNITS, top + 1e-3 * FIBER_RADIUS_UNITS
+    table[0, EPSILON], table[0, UNITS] = 5e-3 * FIBER_RADIUS_UNITS, units
+    return PatchIndex(scene, table, segment.astype(np.int32), copy.astype(np.int32))
+
+
+def look(
+    index: PatchIndex, eye: NDArray[np.float64], directions: NDArray[np.float64], lamps: NDArray[np.float64]
+) -> tuple[Seen, list[Seen]]:
+    """What camera rays meet, and what stands between that and each lamp.
+
+    Parameters
+    ----------
+    eye: (3,), directions: (N, 3) unit vectors, lamps: (K, 3)
+        Camera, rays that go down, and point lights above the fibers; patch frame, metres.
+
+    Returns
+    -------
+    seen, shadows:
+        ``shadows[k].segment`` is ``NOTHING`` where lamp k shines.
+    """
+    n, k = len(directions), len(lamps)
+    segment, copy = np.full((1 + k, n), NOTHING, dtype=np.int32), np.zeros((1 + k, n, 2), dtype=np.int32)
+    _look(
+        np.uint64(embree.function_addresses()[0]), np.uint64(filter_address()),
+        np.array([index.scene.handle], dtype=np.uint64), index.table, index.segment, index.copy,
+        index.units * np.asarray(eye, dtype=np.float64), np.ascontiguousarray(directions, dtype=np.float64),
+        index.units * np.asarray(lamps, dtype=np.float64).reshape(-1, 3), segment, copy,
+    )  # fmt: skip
+    found = [Seen(s, c) for s, c in zip(segment, copy, strict=True)]
+    return found[0], found[1:]
+
+
+_ROW = 1024
+"""Rays that a thread takes at a time."""
+
+
+@njit(**KERNEL, parallel=True)
+def _look(trace, filter_function, handles, table, segments, copies, eye, directions, lamps, segment, copy):
+    count = len(directions)
+    for block in prange((count + _ROW - 1) // _ROW):
+        memory = new_ray_buffer(filter_function)
+        width, height, top = table[0, WIDTH], table[0, HEIGHT], table[0, HIGH]
+        for ray in range(block * _ROW, min(count, (block + 1) * _ROW)):
+            dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+            if dz >= 0.0:
+                continue
+            t = (top - eye[2]) / dz
+            lx, ly, lz = eye[0] + t * dx, eye[1] + t * dy, top
+            ix, iy = np.int64(np.floor(lx / width)), np.int64(np.floor(ly / height))
+            lx, ly = lx - ix * width, ly - iy * height
+            outcome, _, lx, ly, lz, ix, iy, _ = trace_slab(
+                trace, table, handles, memory, 0, 1, lx, ly, lz, ix, iy, dx, dy, dz
+            )
+            if outcome != HIT:
+                continue
+            hit = np.int64(memory[1][PRIM])
+            segment[0, ray] = segments[hit]
+            copy[0, ray, 0], copy[0, ray, 1] = ix + copies[hit, 0], iy + copies[hit, 1]
+            for lamp in range(len(lamps)):
+                sx = lamps[lamp, 0] - (lx + ix * width)
+                sy = lamps[lamp, 1] - (ly + iy * height)
+                sz = lamps[lamp, 2] - lz
+                norm = 1.0 / np.sqrt(sx * sx + sy * sy + sz * sz)
+                outcome, _, _, _, _, jx, jy, _ = trace_slab(
+                    trace, table, handles, memory, 0, 1, lx, ly, lz, ix, iy, sx * norm, sy * norm, sz * norm
+                )
+                if outcome == HIT:
+                    hit = np.int64(memory[1][PRIM])
+                    segment[1 + lamp, ray] = segments[hit]
+                    copy[1 + lamp, ray, 0], copy[1 + lamp, ray, 1] = jx + copies[hit, 0], jy + copies[hit, 1]
+        memory[1][0] = np.uint32(0)  # Numba frees an array after its last use: this is after the last ray
