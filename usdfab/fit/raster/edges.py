@@ -27,26 +27,31 @@ Ints = NDArray[np.int64]
 class Pairs:
     """Pairs of neighbouring pixels, as indices into the flattened picture; ``q`` is to the right of or below ``p``.
 
-    ``r`` is a neighbour of p in the other direction, at whose side a jump function tells how it runs there.
+    ``r`` is a neighbour of p in the other direction, at whose side a jump function tells how it runs there. ``before``
+    and ``after`` are the next pixels in line, on the far sides of p and q; p and q themselves at the picture's border.
     """
 
     p: Ints
     q: Ints
     r: Ints
+    before: Ints
+    after: Ints
 
     def __getitem__(self, chosen: NDArray) -> Pairs:
-        return Pairs(self.p[chosen], self.q[chosen], self.r[chosen])
+        return Pairs(*(getattr(self, name)[chosen] for name in ("p", "q", "r", "before", "after")))
 
 
 def pixel_pairs(height: int, width: int) -> tuple[Pairs, Pairs]:
     """All pairs along the rows and along the columns of a picture of at least 2 x 2 pixels."""
     number = np.arange(height * width).reshape(height, width)
     below = np.vstack([number[1:], number[-2]])
-    right = np.hstack([number[:, 1:], number[:, -2:-1]])
-    return (
-        Pairs(number[:, :-1].ravel(), number[:, 1:].ravel(), below[:, :-1].ravel()),
-        Pairs(number[:-1].ravel(), number[1:].ravel(), right[:-1].ravel()),
-    )
+    return _pairs_along_rows(number, below), _pairs_along_rows(number.T, np.hstack([number[:, 1:], number[:, -2:-1]]).T)
+
+
+def _pairs_along_rows(number: Ints, aside: Ints) -> Pairs:
+    before = np.hstack([number[:, :1], number[:, :-1]])
+    after = np.hstack([number[:, 1:], number[:, -1:]])
+    return Pairs(*(a.ravel() for a in (number[:, :-1], number[:, 1:], aside[:, :-1], before[:, :-1], after[:, 1:])))
 
 
 def crossing(at_p: Tensor, at_q: Tensor) -> Tensor:
@@ -56,18 +61,36 @@ def crossing(at_p: Tensor, at_q: Tensor) -> Tensor:
     return (-at_p / safe).clamp(0.0, 1.0)
 
 
-def blended(values: Tensor, parts: list[tuple[Pairs, Tensor]]) -> Tensor:
+@dataclass(frozen=True)
+class Jumps:
+    """Where between pixels things jump: t (M,) in [0, 1], counted from ``pairs.p``.
+
+    ``smooth_p``, ``smooth_q`` (M,) say where the next pixel in line shows the same thing as p, or as q, so that the two
+    tell how it changes towards the jump.
+    """
+
+    pairs: Pairs
+    t: Tensor
+    smooth_p: NDArray[np.bool_]
+    smooth_q: NDArray[np.bool_]
+
+
+def blended(values: Tensor, parts: list[Jumps]) -> Tensor:
     """Values of pixels (N, C), those of pairs blended by where the jumps between them lie.
 
-    Parameters
-    ----------
-    parts:
-        Pairs and t (M,) in [0, 1], counted from ``pairs.p``; all blend the values as they were.
+    On either side of a jump the values run straight on (or, where nothing is known of them, stay as they are) up to the
+    jump, and each pixel is the mean over its width. A jump that passes the middle of a pixel then changes nothing
+    suddenly: the pixel takes the other side's value there, which is the same. All parts blend the values as they were.
     """
     result = values
-    for pairs, t in parts:
-        p, q = torch.from_numpy(pairs.p), torch.from_numpy(pairs.q)
-        difference = values[q] - values[p]
-        result = result.index_add(0, p, (0.5 - t).clamp_min(0.0)[:, None] * difference)
-        result = result.index_add(0, q, (0.5 - t).clamp_max(0.0)[:, None] * difference)
+    for part in parts:
+        p, q = torch.from_numpy(part.pairs.p), torch.from_numpy(part.pairs.q)
+        slope_p = torch.from_numpy(part.smooth_p)[:, None] * (values[p] - values[torch.from_numpy(part.pairs.before)])
+        slope_q = torch.from_numpy(part.smooth_q)[:, None] * (values[torch.from_numpy(part.pairs.after)] - values[q])
+        # Integral over x from t to 1/2 of what lies beyond the jump minus what lies before it, x counted from p.
+        width = (0.5 - part.t)[:, None]
+        at_p = values[q] - slope_q - values[p]
+        moved = width * (at_p + (slope_q - slope_p) * (0.5 * (part.t + 0.5))[:, None])
+        towards_p = (width > 0.0) * moved
+        result = result.index_add(0, p, towards_p).index_add(0, q, moved - towards_p)
     return result

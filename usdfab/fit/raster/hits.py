@@ -79,26 +79,26 @@ class Meeting(NamedTuple):
     along: Tensor
 
 
-def meet(s: Segments, direction: Tensor, limit: float = 1.0) -> Meeting:
-    """Where rays enter the infinite cylinders around segments.
-
-    Parameters
-    ----------
-    direction: (N, 3) unit vectors
-    limit:
-        h is held in [-limit, limit]: rays that miss are taken at the silhouette.
-    """
+def cylinder(s: Segments, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """h (N,), the distance along the ray at which it passes the axis, and how long a radius is along the ray."""
     axis = s.end - s.start
-    length = torch.sqrt(dot(axis, axis) + _EPSILON)
-    axis = axis / length[:, None]
+    axis = axis / torch.sqrt(dot(axis, axis) + _EPSILON)[:, None]
     b = dot(direction, axis)
     sin2 = (1.0 - b * b).clamp_min(1e-6)
-    ee, dd = dot(s.start, axis), dot(s.start, direction)
-    h = offset(s, direction).clamp(-limit, limit)
-    # Closest approach of ray and axis, from there back to the surface.
-    back = s.radius * torch.sqrt((1.0 - h * h).clamp_min(0.0) + _EPSILON) / torch.sqrt(sin2)
-    distance = (dd - b * ee) / sin2 - back
-    along = (distance * b - ee) / length
+    middle = (dot(s.start, direction) - b * dot(s.start, axis)) / sin2
+    return offset(s, direction), middle, s.radius / torch.sqrt(sin2)
+
+
+def meet(s: Segments, direction: Tensor) -> Meeting:
+    """Where rays enter the infinite cylinders around segments; rays that miss are taken at the side.
+
+    ``direction`` (N, 3) unit vectors.
+    """
+    h, middle, half = cylinder(s, direction)
+    h = h.clamp(-1.0, 1.0)
+    distance = middle - half * torch.sqrt((1.0 - h * h).clamp_min(0.0) + _EPSILON)
+    axis = s.end - s.start
+    along = dot(distance[:, None] * direction - s.start, axis) / (dot(axis, axis) + _EPSILON)
     return Meeting(distance, h, along)
 
 

@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from usdfab.fit.raster.edges import Pairs, crossing
-from usdfab.fit.raster.hits import Gatherer, Segments, meet, offset
+from usdfab.fit.raster.edges import Ints, Jumps, Pairs, crossing
+from usdfab.fit.raster.hits import Gatherer, Segments, cylinder, offset
 from usdfab.fit.raster.visibility import NOTHING, Seen
 
 Bools = NDArray[np.bool_]
@@ -24,11 +24,11 @@ class Rays:
     direction: Tensor
 
 
-def jumps(gather: Gatherer, seen: Seen, pairs: Pairs) -> Bools:
-    """(M,) where two pixels do not show the same piece of fiber, nor two that continue each other."""
+def jumps(gather: Gatherer, seen: Seen, p: Ints, q: Ints) -> Bools:
+    """(M,) where pixels p and q (M,) do not show the same piece of fiber, nor two that continue each other."""
     model = gather.model
-    a, b = seen.segment[pairs.p].astype(np.int64), seen.segment[pairs.q].astype(np.int64)
-    copy_a, copy_b = seen.copy[pairs.p], seen.copy[pairs.q]
+    a, b = seen.segment[p].astype(np.int64), seen.segment[q].astype(np.int64)
+    copy_a, copy_b = seen.copy[p], seen.copy[q]
     same_copy = (copy_a == copy_b).all(axis=1)
     same = (a == b) & same_copy | (a >= 0) & (b >= 0) & (model.curve[a] == model.curve[b]) & same_copy
     for one, other, of_one, of_other in ((a, b, copy_a, copy_b), (b, a, copy_b, copy_a)):
@@ -37,85 +37,80 @@ def jumps(gather: Gatherer, seen: Seen, pairs: Pairs) -> Bools:
     return ~same
 
 
-@dataclass(frozen=True)
-class _Look:
-    """h and depth of the fibers that pixels ``of`` see, from the rays of pixels ``at``; no gradients."""
-
-    h: Tensor
-    depth: Tensor
-
-
-def _look(gather: Gatherer, seen: Seen, rays: Rays, of: NDArray, at: NDArray) -> _Look:
-    s = gather(seen, rays.start[at], of)
-    direction = rays.direction[torch.from_numpy(at)]
-    return _Look(offset(s, direction), _from_start(rays, at, meet(s, direction).distance, gather))
-
-
-def _from_start(rays: Rays, at: NDArray, distance: Tensor, gather: Gatherer) -> Tensor:
-    """Heights below the cloth's plane, which rays of different pixels have in common: -z, in units."""
-    return -(distance * rays.direction[torch.from_numpy(at), 2])
-
-
 def visible_edges(
     gather: Gatherer, seen: Seen, rays: Rays, pairs: Pairs, along_row: bool
-) -> list[tuple[Pairs, Tensor]]:
-    """Silhouettes and crossings between pixels, for ``edges.blended``.
+) -> list[Jumps]:
+    """Where between pixels one fiber gives way to another, for ``edges.blended``.
+
+    Either the nearer fiber ends, at its silhouette |h| = 1, or two fibers run into each other. Both are one: a fiber
+    with its axis at depth a shows in front of a surface at depth d where its half thickness there, sqrt(1 - h^2) radii,
+    is more than (a - d) / radius. So the jump function of the fiber is sqrt(h^2 + max(a - d, 0)^2 / radius^2) - 1.
 
     Parameters
     ----------
     pairs:
         All pairs along the rows or, if not ``along_row``, along the columns.
     """
-    pairs = pairs[jumps(gather, seen, pairs)]
-    nothing_p, nothing_q = seen.segment[pairs.p] == NOTHING, seen.segment[pairs.q] == NOTHING
+    pairs = pairs[jumps(gather, seen, pairs.p, pairs.q)]
+    if not len(pairs.p):
+        return []
     with torch.no_grad():
-        # Fiber a is what p sees, b what q sees; where that is nothing, the other one stands in.
-        of_a, of_b = np.where(nothing_p, pairs.q, pairs.p), np.where(nothing_q, pairs.p, pairs.q)
-        a_p, a_q, a_r = (_look(gather, seen, rays, of_a, at) for at in (pairs.p, pairs.q, pairs.r))
-        b_p, b_q, b_r = (_look(gather, seen, rays, of_b, at) for at in (pairs.p, pairs.q, pairs.r))
-        a_covers_q, b_covers_p = (a_q.h.abs() < 1.0).numpy(), (b_p.h.abs() < 1.0).numpy()
-        a_nearer = (a_p.depth <= b_q.depth).numpy()
-        cross = a_covers_q & b_covers_p & ~nothing_p & ~nothing_q
-        # Whose silhouette: of the one that misses the other's pixel, the nearer if both do.
-        of_q = nothing_p | ~nothing_q & (a_covers_q & ~b_covers_p | ~a_covers_q & ~b_covers_p & ~a_nearer)
-        row, column = _steepness(cross, of_q, a_p, a_q, a_r, b_p, b_q, b_r)
+        ends, other = _ending(gather, seen, rays, pairs)
+        at_p, at_q, at_r = (_showing(gather, seen, rays, ends, other, at) for at in (pairs.p, pairs.q, pairs.r))
+        row, column = (at_q - at_p).abs(), (at_r - at_p).abs()
         keep = (row >= column if along_row else row > column).numpy()
-        sign = torch.sign(torch.where(torch.from_numpy(of_q), b_p.h, a_q.h))
-    result = []
-    chosen = keep & ~cross
-    if chosen.any():
-        mine = pairs[chosen]
-        owner = np.where(of_q[chosen], mine.q, mine.p)
-        result.append((mine, _silhouette(gather, seen, rays, mine, owner, sign[torch.from_numpy(chosen)])))
-    chosen = keep & cross
-    if chosen.any():
-        mine = pairs[chosen]
-        gaps = []
-        for at in (mine.p, mine.q):
-            depth_a, depth_b = (_look(gather, seen, rays, of, at).depth for of in (mine.p, mine.q))
-            gaps.append(depth_a - depth_b)
-        result.append((mine, crossing(*gaps)))
-    return result
-
-
-def _steepness(cross: Bools, of_q: Bools, a_p: _Look, a_q: _Look, a_r: _Look, b_p: _Look, b_q: _Look, b_r: _Look):  # noqa: ANN202
-    """How much the jump function changes towards q and towards r, (M,) each."""
-    is_cross, is_b = torch.from_numpy(cross), torch.from_numpy(of_q)
-
-    def change(a_to: _Look, b_to: _Look) -> Tensor:
-        gap = (a_to.depth - b_to.depth) - (a_p.depth - b_p.depth)
-        return torch.where(is_cross, gap, torch.where(is_b, b_to.h - b_p.h, a_to.h - a_p.h)).abs()
-
-    return change(a_q, b_q), change(a_r, b_r)
-
-
-def _silhouette(gather: Gatherer, seen: Seen, rays: Rays, pairs: Pairs, owner: NDArray, sign: Tensor) -> Tensor:
-    """t at which the side ``sign`` of the fibers that pixels ``owner`` see passes between p and q."""
-    at_p, at_q = (
-        sign * offset(gather(seen, rays.start[at], owner), rays.direction[torch.from_numpy(at)]) - 1.0
-        for at in (pairs.p, pairs.q)
+    if not keep.any():
+        return []
+    pairs, ends, other = pairs[keep], ends[keep], other[keep]
+    t = crossing(*(_showing(gather, seen, rays, ends, other, at) for at in (pairs.p, pairs.q)))
+    smooth_p, smooth_q = (
+        (near != far) & ~jumps(gather, seen, near, far)
+        for near, far in ((pairs.p, pairs.before), (pairs.q, pairs.after))
     )
-    return crossing(at_p, at_q)
+    return [Jumps(pairs, t, smooth_p, smooth_q)]
+
+
+def _ending(gather: Gatherer, seen: Seen, rays: Rays, pairs: Pairs) -> tuple[Ints, Ints]:
+    """The pixels of each pair that see the fiber which ends between them, and what it ends in front of.
+
+    It is the fiber that is farther out at the other's pixel, and if both are beyond their sides there, the nearer.
+    """
+    nothing_p, nothing_q = seen.segment[pairs.p] == NOTHING, seen.segment[pairs.q] == NOTHING
+    of_a, of_b = np.where(nothing_p, pairs.q, pairs.p), np.where(nothing_q, pairs.p, pairs.q)
+    out_a, out_b = (
+        _profile(gather, seen, rays, of, at)[0].abs().numpy() for of, at in ((of_a, pairs.q), (of_b, pairs.p))
+    )
+    depth_a, depth_b = (_depth(*_profile(gather, seen, rays, of, of)).numpy() for of in (of_a, of_b))
+    a_ends = np.where((out_a > 1.0) & (out_b > 1.0), depth_a <= depth_b, out_a > out_b)
+    a_ends = nothing_q | ~nothing_p & a_ends
+    return np.where(a_ends, pairs.p, pairs.q), np.where(a_ends, pairs.q, pairs.p)
+
+
+def _showing(gather: Gatherer, seen: Seen, rays: Rays, ends: Ints, other: Ints, at: Ints) -> Tensor:
+    """The jump function of the fibers that pixels ``ends`` see before those that ``other`` see, at pixels ``at``."""
+    h, axis, unit = _profile(gather, seen, rays, ends, at)
+    solid = np.flatnonzero(seen.segment[other] != NOTHING)
+    rows = torch.from_numpy(solid)
+    behind = _depth(*_profile(gather, seen, rays, other[solid], at[solid]))
+    sunk = torch.zeros_like(h).index_copy(0, rows, ((axis[rows] - behind) / unit[rows]).clamp_min(0.0))
+    return torch.sqrt(h * h + sunk * sunk + 1e-12) - 1.0
+
+
+def _profile(gather: Gatherer, seen: Seen, rays: Rays, of: Ints, at: Ints) -> tuple[Tensor, Tensor, Tensor]:
+    """h of the fibers that pixels ``of`` see from the rays of pixels ``at``, the depth of their axes, their radii.
+
+    Depths are below the cloth's plane, which the rays of all pixels have in common; radii as long as along the ray.
+    """
+    s = gather(seen, rays.start[at], of)
+    direction = rays.direction[torch.from_numpy(at)]
+    down = -direction[:, 2]
+    h, middle, half = cylinder(s, direction)
+    return h, middle * down, half * down
+
+
+def _depth(h: Tensor, axis: Tensor, unit: Tensor) -> Tensor:
+    """Of the surface; beyond the sides, of the sides."""
+    return axis - unit * torch.sqrt((1.0 - h * h).clamp_min(1e-9))
 
 
 def shadow_edges(
@@ -127,7 +122,7 @@ def shadow_edges(
     lamp: NDArray[np.float64],
     pairs: Pairs,
     along_row: bool,
-) -> list[tuple[Pairs, Tensor]]:
+) -> list[Jumps]:
     """Rims of one lamp's shadows between pixels of the same fiber, for ``edges.blended``.
 
     Parameters
@@ -138,7 +133,7 @@ def shadow_edges(
     """
     dark = shadow.segment != NOTHING
     on_fiber = seen.segment[pairs.p] != NOTHING
-    pairs = pairs[(dark[pairs.p] != dark[pairs.q]) & on_fiber & ~jumps(gather, seen, pairs)]
+    pairs = pairs[(dark[pairs.p] != dark[pairs.q]) & on_fiber & ~jumps(gather, seen, pairs.p, pairs.q)]
     if not len(pairs.p):
         return []
     owner = np.where(dark[pairs.p], pairs.p, pairs.q)
@@ -154,7 +149,7 @@ def shadow_edges(
 
     with torch.no_grad():
         # At r another fiber may be seen: then nothing tells how the rim runs, and rows take it.
-        same = ~jumps(gather, seen, Pairs(pairs.p, pairs.r, pairs.r)) & (seen.segment[pairs.r] != NOTHING)
+        same = ~jumps(gather, seen, pairs.p, pairs.r) & (seen.segment[pairs.r] != NOTHING)
         here = cast(pairs.p)
         row, column = (cast(pairs.q) - here).abs(), (cast(np.where(same, pairs.r, pairs.p)) - here).abs()
         keep = (row >= column if along_row else row > column).numpy() & (same | along_row)
@@ -162,4 +157,6 @@ def shadow_edges(
     pairs, owner, lit = pairs[keep], owner[keep], lit[keep]
     if not len(pairs.p):
         return []
-    return [(pairs, crossing(sign * cast(pairs.p) - 1.0, sign * cast(pairs.q) - 1.0))]
+    # Light and shadow are the same everywhere on their sides of the rim: nothing runs on.
+    flat = np.zeros(len(pairs.p), dtype=bool)
+    return [Jumps(pairs, crossing(sign * cast(pairs.p) - 1.0, sign * cast(pairs.q) - 1.0), flat, flat)]
