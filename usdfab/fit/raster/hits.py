@@ -65,45 +65,67 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum(dim=-1)
 
 
-def offset(s: Segments, direction: Tensor) -> Tensor:
-    """h: signed distance of the ray from the fiber's axis in fiber radii, (N,). Beyond -1 and 1 the ray misses."""
-    across = torch.linalg.cross(direction, s.end - s.start, dim=-1)
-    return dot(s.start, across) / (torch.sqrt(dot(across, across) + _EPSILON) * s.radius)
+def pass_by(s: Segments, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """How rays pass segments, which are cylinders that end in spheres.
 
-
-class Meeting(NamedTuple):
-    """Where rays enter fibers: distance along the ray (N,), offset h (N,), place along the segment in [0, 1] (N,)."""
-
-    distance: Tensor
-    h: Tensor
-    along: Tensor
-
-
-def cylinder(s: Segments, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """h (N,), the distance along the ray at which it passes the axis, and how long a radius is along the ray."""
-    axis = s.end - s.start
-    axis = axis / torch.sqrt(dot(axis, axis) + _EPSILON)[:, None]
+    Returns
+    -------
+    h: (N,)
+        Signed distance of the ray from the axis, or where it meets the sphere at an end from its centre, in fiber
+        radii: beyond -1 and 1 the ray misses.
+    middle, half: (N,)
+        The surface is at ``middle - half * sqrt(1 - h^2)`` along the ray.
+    """
+    chord = s.end - s.start
+    length = torch.sqrt(dot(chord, chord) + _EPSILON)
+    axis = chord / length[:, None]
     b = dot(direction, axis)
     sin2 = (1.0 - b * b).clamp_min(1e-6)
     middle = (dot(s.start, direction) - b * dot(s.start, axis)) / sin2
-    return offset(s, direction), middle, s.radius / torch.sqrt(sin2)
+    half = s.radius / torch.sqrt(sin2)
+    across = torch.linalg.cross(direction, axis, dim=-1)
+    h = dot(s.start, across) / (torch.sqrt(sin2) * s.radius)
+
+    # The two segments at a joint share its sphere, so that it does not matter which of them Embree names.
+    entry = middle - half * torch.sqrt((1.0 - h * h).clamp_min(0.0) + _EPSILON)
+    along = b * entry - dot(s.start, axis)
+    past_end = along > length
+    center = torch.where(past_end[:, None], s.end, s.start)
+    nearest = dot(center, direction)
+    aside = center - nearest[:, None] * direction
+    distance = torch.sqrt(dot(aside, aside) + _EPSILON) / s.radius
+    inside = (along >= 0.0) & ~past_end
+    return (
+        torch.where(inside, h, torch.where(h < 0.0, -distance, distance)),
+        torch.where(inside, middle, nearest),
+        torch.where(inside, half, s.radius),
+    )
+
+
+class Meeting(NamedTuple):
+    """Where rays enter fibers: distance along the ray (N,), unit tangent of the smooth fiber there (N, 3), offset h."""
+
+    distance: Tensor
+    tangent: Tensor
+    h: Tensor
 
 
 def meet(s: Segments, direction: Tensor) -> Meeting:
-    """Where rays enter the infinite cylinders around segments; rays that miss are taken at the side.
+    """Where rays enter segments; rays that miss are taken at the side.
 
-    ``direction`` (N, 3) unit vectors.
+    ``direction`` (N, 3) unit vectors. The tangent is blended along the segment, so that it runs on smoothly in the next
+    one, and h belongs to it: with the surface's normal projected across the tangent, as the tracer does.
     """
-    h, middle, half = cylinder(s, direction)
+    h, middle, half = pass_by(s, direction)
     h = h.clamp(-1.0, 1.0)
     distance = middle - half * torch.sqrt((1.0 - h * h).clamp_min(0.0) + _EPSILON)
-    axis = s.end - s.start
-    along = dot(distance[:, None] * direction - s.start, axis) / (dot(axis, axis) + _EPSILON)
-    return Meeting(distance, h, along)
-
-
-def tangent_at(s: Segments, along: Tensor) -> Tensor:
-    """(N, 3) unit tangent of the smooth fiber at a place of the segment."""
-    u = along.clamp(0.0, 1.0)[:, None]
-    t = (1.0 - u) * s.start_tangent + u * s.end_tangent
-    return t / torch.sqrt(dot(t, t) + _EPSILON)[:, None]
+    chord = s.end - s.start
+    hit = distance[:, None] * direction
+    u = (dot(hit - s.start, chord) / (dot(chord, chord) + _EPSILON)).clamp(0.0, 1.0)[:, None]
+    tangent = (1.0 - u) * s.start_tangent + u * s.end_tangent
+    tangent = tangent / torch.sqrt(dot(tangent, tangent) + _EPSILON)[:, None]
+    normal = hit - (s.start + u * chord)
+    normal = normal - dot(normal, tangent)[:, None] * tangent
+    across = torch.linalg.cross(direction, tangent, dim=-1)
+    scale = torch.sqrt(dot(across, across) * dot(normal, normal) + _EPSILON)
+    return Meeting(distance, tangent, (-dot(normal, across) / scale).clamp(-1.0, 1.0))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from usdfab.fit.raster.edges import Ints, Jumps, Pairs, crossing
-from usdfab.fit.raster.hits import Gatherer, Segments, cylinder, offset
+from usdfab.fit.raster.hits import Gatherer, Segments, pass_by
 from usdfab.fit.raster.visibility import NOTHING, Seen
 
 Bools = NDArray[np.bool_]
@@ -104,7 +104,7 @@ def _profile(gather: Gatherer, seen: Seen, rays: Rays, of: Ints, at: Ints) -> tu
     s = gather(seen, rays.start[at], of)
     direction = rays.direction[torch.from_numpy(at)]
     down = -direction[:, 2]
-    h, middle, half = cylinder(s, direction)
+    h, middle, half = pass_by(s, direction)
     return h, middle * down, half * down
 
 
@@ -145,7 +145,7 @@ def shadow_edges(
         place = places[torch.from_numpy(at)]
         moved = Segments(s.start - place, s.end - place, s.start_tangent, s.end_tangent, s.radius)
         to_lamp = torch.from_numpy((lamp - rays.start[at]) / gather.scale).to(gather.dtype) - place
-        return offset(moved, to_lamp / torch.linalg.norm(to_lamp, dim=-1, keepdim=True))
+        return pass_by(moved, to_lamp / torch.linalg.norm(to_lamp, dim=-1, keepdim=True))[0]
 
     with torch.no_grad():
         # At r another fiber may be seen: then nothing tells how the rim runs, and rows take it.

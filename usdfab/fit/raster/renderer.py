@@ -13,7 +13,7 @@ from usdfab.fabric import FabricParameters
 from usdfab.fabric.optics import optics_of
 from usdfab.fit.raster.curves import CurveModel, Polylines, Shapes, as_numpy, raster_copies
 from usdfab.fit.raster.edges import blended, pixel_pairs
-from usdfab.fit.raster.hits import Gatherer, Meeting, dot, meet, tangent_at
+from usdfab.fit.raster.hits import Gatherer, Meeting, dot, meet
 from usdfab.fit.raster.jumps import Rays, shadow_edges, visible_edges
 from usdfab.fit.raster.shade import Look, Surface, pieces, radiance
 from usdfab.fit.raster.view import View, view_of
@@ -101,10 +101,9 @@ class RasterRenderer:
         segments = gather(seen, self._rays.start[hit], hit)
         direction = self._rays.direction[torch.from_numpy(hit)]
         met = meet(segments, direction)
-        tangent = tangent_at(segments, met.along)
         lit = self._lit(gather, seen, shadows, hit, met)
         spread = self._pixel / segments.radius
-        colors = self._shaded(seen, hit, Surface(tangent, met.h, direction, spread), met, lit, look_)
+        colors = self._shaded(seen, hit, Surface(met.tangent, met.h, direction, spread), met, lit, look_)
         flat = torch.zeros(len(self._directions), 3, dtype=self._dtype).index_copy(0, torch.from_numpy(hit), colors)
         if self.settings.edges:
             parts = []

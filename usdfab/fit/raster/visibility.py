@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from usdfab.fit.raster.curves import CurveModel
 from usdfab.tracer import embree
-from usdfab.tracer.embree import NEIGHBOR_LEFT, NEIGHBOR_RIGHT, EmbreeScene, curve_scene
+from usdfab.tracer.embree import EmbreeScene, curve_scene
 from usdfab.tracer.intrinsics import KERNEL, PRIM, filter_address, new_ray_buffer
 from usdfab.tracer.patch_scene import FIBER_RADIUS_UNITS
 from usdfab.tracer.slab import HIT, trace_slab
@@ -78,33 +78,15 @@ def index_patch(model: CurveModel, points: NDArray[np.float64], radius: NDArray[
     wide = (last - first + 1)[segment, 0]
     copy = first[segment] + np.c_[place % wide, place // wide]
 
-    # Each segment brings its own four vertices: the one before, its two, the one after.
-    shift = np.c_[copy * period, np.zeros(len(copy))]
-    before, after = model.preceding[segment], model.following[segment]
-    beyond = model.following[after]
-    back = np.c_[model.preceding_shift[segment] * period, np.zeros(len(copy))]
-    on = np.c_[model.following_shift[segment] * period, np.zeros(len(copy))]
-    further = on + np.c_[model.following_shift[after] * period, np.zeros(len(copy))]
-    vertices = np.stack([points[before] + back, points[segment], points[after] + on, points[beyond] + further], axis=1)
-    vertices += shift[:, None, :]
-    thickness = np.broadcast_to(thick[segment][:, None, None], (len(segment), 4, 1))
-    # A neighbour that does not overlap the patch draws no joint: then this segment does.
-    key = (copy[:, 0] + 64) * 128 + copy[:, 1] + 64
-    own = segment * 16384 + key
-    known = np.sort(own)
-
-    def overlaps(other: NDArray[np.int64], wraps: NDArray[np.int64]) -> NDArray[np.bool_]:
-        moved = copy + wraps
-        wanted = other * 16384 + (moved[:, 0] + 64) * 128 + moved[:, 1] + 64
-        where = np.minimum(np.searchsorted(known, wanted), len(known) - 1)
-        return known[where] == wanted
-
-    flags = NEIGHBOR_LEFT * overlaps(before, model.preceding_shift[segment])
-    flags = flags + NEIGHBOR_RIGHT * overlaps(after, model.following_shift[segment])
+    # Each segment brings its own two vertices and ends in two spheres. Embree can leave those out where segments join,
+    # but then loses rays at the joints of such coarse curves.
+    shift = np.c_[copy * period, np.zeros(len(copy))][:, None, :]
+    vertices = np.stack([points[segment], ends[segment]], axis=1) + shift
+    thickness = np.broadcast_to(thick[segment][:, None, None], (len(segment), 2, 1))
     scene = curve_scene(
         np.concatenate([vertices, thickness], axis=2).reshape(-1, 4),
-        4 * np.arange(len(segment)) + 1,
-        flags.astype(np.uint8),
+        2 * np.arange(len(segment)),
+        np.zeros(len(segment), dtype=np.uint8),
     )
     bottom = float((np.minimum(points[:, 2], ends[:, 2]) - thick).min())
     top = float((np.maximum(points[:, 2], ends[:, 2]) + thick).max())
