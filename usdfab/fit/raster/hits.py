@@ -42,10 +42,13 @@ class Gatherer:
 
     def __call__(self, seen: Seen, start: NDArray[np.float64], rows: NDArray[np.int64]) -> Segments:
         """The segments that the rays ``rows`` saw, relative to ``start`` (N, 3) metres, one for each of them."""
-        segment = seen.segment[rows].astype(np.int64)
+        return self.segments(seen.segment[rows].astype(np.int64), seen.copy[rows], start)
+
+    def segments(self, segment: NDArray[np.int64], copy: NDArray, start: NDArray[np.float64]) -> Segments:
+        """The segments (N,) in copies (N, 2) of the patch, relative to ``start`` (N, 3) metres."""
         period = np.array(self.model.size)
-        shift = np.zeros((len(rows), 3))
-        shift[:, :2] = seen.copy[rows] * period
+        shift = np.zeros((len(segment), 3))
+        shift[:, :2] = copy * period
         on = shift.copy()
         on[:, :2] += self.model.following_shift[segment] * period
         first, second = torch.from_numpy(segment), torch.from_numpy(self.model.following[segment])
@@ -58,6 +61,45 @@ class Gatherer:
             tangents[second],
             torch.where(torch.from_numpy(self.model.system[segment] == 0), radius[0], radius[1]),
         )
+
+    def beside(
+        self, seen: Seen, start: NDArray[np.float64], direction: Tensor, rows: NDArray[np.int64]
+    ) -> Segments:
+        """The segments of the fibers that the rays ``rows`` saw which lie nearest to other rays, from ``start``.
+
+        From the segment that was seen, along the fiber, ``STEPS`` segments at most: where along a fiber one segment
+        gives way to the next must not matter.
+        """
+        segment, copy = seen.segment[rows].astype(np.int64), seen.copy[rows].astype(np.int64)
+        with torch.no_grad():
+            for _ in range(STEPS):
+                along = _place(self.segments(segment, copy, start), direction).numpy()
+                on, back = along > 1.0, along < 0.0
+                if not (on | back).any():
+                    break
+                copy = copy + on[:, None] * self.model.following_shift[segment]
+                copy = copy + back[:, None] * self.model.preceding_shift[segment]
+                segment = np.where(
+                    on, self.model.following[segment], np.where(back, self.model.preceding[segment], segment)
+                )
+        return self.segments(segment, copy, start)
+
+
+STEPS = 2
+"""Segments along a fiber that are searched for the one beside a ray."""
+
+
+def _place(s: Segments, direction: Tensor) -> Tensor:
+    """Where along the segments, in [0, 1], rays enter their cylinders, or pass them by."""
+    chord = s.end - s.start
+    length = torch.sqrt(dot(chord, chord) + _EPSILON)
+    axis = chord / length[:, None]
+    b = dot(direction, axis)
+    sin2 = (1.0 - b * b).clamp_min(1e-6)
+    middle = (dot(s.start, direction) - b * dot(s.start, axis)) / sin2
+    h = dot(s.start, torch.linalg.cross(direction, axis, dim=-1)) / (torch.sqrt(sin2) * s.radius)
+    entry = middle - s.radius * torch.sqrt((1.0 - h * h).clamp_min(0.0) / sin2)
+    return (b * entry - dot(s.start, axis)) / length
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:

@@ -101,8 +101,8 @@ def _profile(gather: Gatherer, seen: Seen, rays: Rays, of: Ints, at: Ints) -> tu
 
     Depths are below the cloth's plane, which the rays of all pixels have in common; radii as long as along the ray.
     """
-    s = gather(seen, rays.start[at], of)
     direction = rays.direction[torch.from_numpy(at)]
+    s = gather.beside(seen, rays.start[at], direction, of)
     down = -direction[:, 2]
     h, middle, half = pass_by(s, direction)
     return h, middle * down, half * down
