@@ -93,7 +93,7 @@ def load_features(
     ----------
     name_or_path:
         ``vgg16`` ships with usdfab, to conv4_1. ``vgg19`` is the one of the paper, in torchvision's training, where
-        torch.hub has it in its cache. A path names a safetensors file with keys ``convB_C.weight`` and ``convB_C.bias``.
+        torch.hub has it in its cache. A path names a safetensors file, see :func:`read_convolutions`.
     dtype:
         Of the convolutions; see :func:`fast_dtype`. float64 is for checks.
     taps:
@@ -132,12 +132,11 @@ def fast_dtype() -> torch.dtype:
 
 
 def encode_srgb(linear: Tensor) -> Tensor:
-    """Linear light as sRGB values, any shape; differentiable everywhere, as :func:`usdfab.srgb.linear_to_srgb` from 0 on.
-
-    Below 0 the line through 0 goes on.
-    """
-    curve = 1.055 * linear.clamp(min=0.0031308) ** (1.0 / 2.4) - 0.055
-    return torch.where(linear <= 0.0031308, 12.92 * linear, curve)
+    """Linear light as sRGB values, any shape, as :func:`usdfab.srgb.linear_to_srgb`; differentiable everywhere."""
+    size = linear.abs()
+    # The power's slope at 0 is infinite, and 0 times that is no number: clamp first, choose then.
+    curve = 1.055 * size.clamp(min=0.0031308) ** (1.0 / 2.4) - 0.055
+    return torch.where(size <= 0.0031308, 12.92 * linear, linear.sign() * curve)
 
 
 def _block(name: str) -> int:

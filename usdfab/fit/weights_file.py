@@ -70,7 +70,7 @@ def read_convolutions(name_or_path: str | Path) -> Convolutions:
 
 
 def torchvision_convolutions(state: dict[str, Tensor]) -> Convolutions:
-    """The convolutions to conv4_1 out of the state dictionary of ``torchvision.models.vgg19`` (``features.N.weight``)."""
+    """The convolutions to conv4_1 from the state of ``torchvision.models.vgg19`` (keys ``features.N.weight``)."""
     layers, position = {}, 0
     for block, count in enumerate(VGG19_CONVOLUTIONS[:4], start=1):
         for index in range(1, (count if block < 4 else 1) + 1):
@@ -123,7 +123,8 @@ def _cached_vgg19() -> Convolutions:
         raise UsdfabError(
             "torchvision's VGG-19 is not on this machine, and nothing is downloaded unasked",
             place=str(path),
-            remedy="install torchvision and run python -c \"from torchvision.models import vgg19; vgg19(weights='DEFAULT')\"",
+            remedy="install torchvision and run "
+            "python -c \"from torchvision.models import vgg19; vgg19(weights='DEFAULT')\"",
         )
     _checked_bytes(path, TORCHVISION_SHA256)
     # torch's own file format; only tensors are unpacked, no code can run.
