@@ -84,9 +84,11 @@ def main() -> None:
                 values.append(value.item())
             cosine = torch.nn.functional.cosine_similarity(*gradients, dim=0)
             slopes = [float((g * render.flatten().double()).sum()) for g in gradients]
+            change = 100 * (slopes[1] / slopes[0] - 1)
+            difference = 100 * (values[1] / values[0] - 1)
             print(
-                f"  bfloat16 against float32, {name:<7} loss {values[0]:.4f}, "
-                f"{100 * (values[1] / values[0] - 1):+.2f} %; gradients' cosine {float(cosine):.4f}; slope with exposure {100 * (slopes[1] / slopes[0] - 1):+.2f} %"
+                f"  bfloat16 against float32, {name:<7} loss {values[0]:.4f}, {difference:+.2f} %; "
+                f"gradients' cosine {float(cosine):.4f}; slope with exposure {change:+.2f} %"
             )
 
 

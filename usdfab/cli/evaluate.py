@@ -9,7 +9,13 @@ from usdfab.cli.options import Json, print_json, progress_bar
 
 
 def run(
-    what: Literal["photos", "losses"], folder: Path, /, *, features: str = "vgg16", fast: bool = False, json: Json = False
+    what: Literal["photos", "losses"],
+    folder: Path,
+    /,
+    *,
+    features: str = "vgg16",
+    fast: bool = False,
+    json: Json = False,
 ) -> None:
     """Judge usdfab's estimates on labelled photos, or the losses of the fit on any photos, and print a table.
 
@@ -38,9 +44,9 @@ def run(
 
 
 def _losses(folder: Path, features: str, fast: bool, json: bool) -> None:
-    from usdfab.cli.system import require_torch
+    from usdfab.fit.extra import require_fit_extra
 
-    require_torch("evaluate losses")
+    require_fit_extra("evaluate losses")
     from usdfab.fit.features import fast_dtype, load_features
     from usdfab.fit.loss_evaluation import evaluate_losses, format_losses
 

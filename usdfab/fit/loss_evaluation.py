@@ -56,6 +56,22 @@ class LossQuality:
     shifted: float
     noisy: float
 
+    def summary(self) -> dict[str, object]:
+        """For ``--json``: medians and the numbers of the table."""
+        medians = {f"{name}_median": float(np.median(getattr(self, name))) for name in ("same", "other", "matched")}
+        changed = {name: {"times": times, "share_rising": share} for name, (times, share) in self.changed.items()}
+        return (
+            {"kind": self.kind}
+            | medians
+            | {
+                "separation": self.separation,
+                "probability_right": self.right,
+                "shifted": self.shifted,
+                "noisy": self.noisy,
+                "changed": changed,
+            }
+        )
+
     @property
     def separation(self) -> float:
         """Distance of ln(loss) between other fabrics in the same colours and the same one, in standard deviations."""
@@ -136,13 +152,11 @@ def _evaluate(
         shifted.append(_loss(photo[..., down : down + half, right : right + half], target))
         grain = 1.0 + NOISE * torch.randn(corner.shape, generator=noise)
         noisy.append(_loss((corner * grain).clamp(min=0.0), target))
-        for step in NEIGHBOURS:
-            j = (i + step) % len(photos)
-            if j != i:
-                side = photos[j].shape[-1] // 2
-                stranger = photos[j][..., :side, :side]
-                other.append(_loss(stranger, target))
-                matched.append(_loss(_with_colors_of(stranger, corner), target))
+        for j in sorted({(i + step) % len(photos) for step in NEIGHBOURS} - {i}):
+            side = photos[j].shape[-1] // 2
+            stranger = photos[j][..., :side, :side]
+            other.append(_loss(stranger, target))
+            matched.append(_loss(_with_colors_of(stranger, corner), target))
         if report:
             report(i + 1)
     ratios = {name: (float(np.median(v)), float(np.mean(np.array(v) > 1.0))) for name, v in changed.items()}
