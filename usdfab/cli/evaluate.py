@@ -50,7 +50,7 @@ def _losses(folder: Path, features: str, fast: bool, json: bool) -> None:
     from usdfab.fit.features import fast_dtype, load_features
     from usdfab.fit.loss_evaluation import evaluate_losses, format_losses
 
-    net = load_features(features, **({"dtype": fast_dtype()} if fast else {}))
+    net = load_features(features, dtype=fast_dtype()) if fast else load_features(features)
     with progress_bar("Losses") as update:
         results = evaluate_losses(folder, net, progress=update)
     if json:

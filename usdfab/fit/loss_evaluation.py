@@ -43,7 +43,7 @@ class LossQuality:
         deviation of each colour channel.
     changed:
         For each change, the median over photos of the loss of the changed other quarter over that of the unchanged,
-        and the share of photos in which it is larger.
+        the share of photos in which it is larger, and the median's logarithm in standard deviations of ln(same).
     shifted, noisy:
         Median losses of the target itself, shifted by a few pixels, and with noise of a fifth of each pixel's value.
     """
@@ -52,14 +52,17 @@ class LossQuality:
     same: tuple[float, ...]
     other: tuple[float, ...]
     matched: tuple[float, ...]
-    changed: dict[str, tuple[float, float]]
+    changed: dict[str, tuple[float, float, float]]
     shifted: float
     noisy: float
 
     def summary(self) -> dict[str, object]:
         """For ``--json``: medians and the numbers of the table."""
         medians = {f"{name}_median": float(np.median(getattr(self, name))) for name in ("same", "other", "matched")}
-        changed = {name: {"times": times, "share_rising": share} for name, (times, share) in self.changed.items()}
+        changed = {
+            name: {"times": times, "share_rising": share, "deviations": d}
+            for name, (times, share, d) in self.changed.items()
+        }
         return (
             {"kind": self.kind}
             | medians
@@ -130,6 +133,7 @@ def format_losses(results: Sequence[LossQuality]) -> str:
     ]
     for name in results[0].changed:
         rows.append((f"other part, {name}: times", lambda r, name=name: r.changed[name][0]))  # type: ignore[misc]
+        rows.append(("  in standard deviations of same photo", lambda r, name=name: r.changed[name][2]))  # type: ignore[misc]
         rows.append(("  share of photos in which it rises", lambda r, name=name: r.changed[name][1]))  # type: ignore[misc]
     lines = [f"{'':<40}" + "".join(f"{r.kind:>12}" for r in results)]
     return "\n".join(lines + [f"{label:<40}" + "".join(f"{value(r):12.3f}" for r in results) for label, value in rows])
@@ -159,7 +163,11 @@ def _evaluate(
             matched.append(_loss(_with_colors_of(stranger, corner), target))
         if report:
             report(i + 1)
-    ratios = {name: (float(np.median(v)), float(np.mean(np.array(v) > 1.0))) for name, v in changed.items()}
+    spread = max(float(np.log(same).std()), 1e-9)
+    ratios = {}
+    for name, values in changed.items():
+        times = float(np.median(values))
+        ratios[name] = (times, float(np.mean(np.array(values) > 1.0)), float(np.log(times)) / spread)
     medians = float(np.median(shifted)), float(np.median(noisy))
     return LossQuality(kind, tuple(same), tuple(other), tuple(matched), ratios, *medians)
 

@@ -21,7 +21,9 @@ LEVELS = (2, 4, 8)
 """By how much images are reduced before their features are computed (Li et al. 2024, eq. 12)."""
 
 Kind = Literal["gram", "covariance"]
-DEFAULT_KIND: Kind = "gram"
+DEFAULT_KIND: Kind = "covariance"
+"""``usdfab evaluate losses`` on 15 photos: cloths made equal in colour lie 3.9 deviations apart, with ``gram`` 3.6, and
+changed scale, direction, contrast and sharpness stand out more from the chance of which part of the cloth is seen."""
 
 SCALE_TOLERANCE = 0.01
 """Relative difference up to which two scales in pixels per metre are the same."""
@@ -80,7 +82,7 @@ class Target:
         levels:
             By how much the image is reduced, antialiased by area, before its features are computed.
         kind:
-            ``gram``: Gram matrices, as the paper; ``covariance``: mean and covariance, each divided by its size.
+            ``gram``: Gram matrices, as the paper; ``covariance``: means and covariances, each divided by its size.
 
         Raises
         ------
