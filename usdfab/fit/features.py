@@ -125,8 +125,8 @@ def load_features(
 def fast_dtype() -> torch.dtype:
     """bfloat16 where this CPU multiplies it natively (AVX-512 BF16 or AMX), which halves the time; else float32.
 
-    Measured by ``tests/benchmarks/bench_features.py``: the loss differs by 0.05 %, the gradient to the image by 2 degrees;
-    at a hundredth of the usual loss, where only noise differs, by 5 % and 10 degrees.
+    Measured by ``tests/benchmarks/bench_features.py``: the loss differs by 0.05 %, the gradient to the image by 2
+    degrees; at a hundredth of the usual loss, where only noise differs, by 5 % and 10 degrees.
     """
     supported = getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
     return torch.bfloat16 if supported() else torch.float32
