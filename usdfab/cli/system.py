@@ -13,6 +13,7 @@ from usdfab.errors import UsdfabError
 LIBRARIES = (
     "numpy", "scipy", "numba", "usd-core", "embreex", "openimageio", "xatlas", "cyclopts", "mitsuba", "drjit",
     "karellen-llvm-core", "mitsuba-oidn", "pyvista", "distributed", "torch",
+    "safetensors",
 )  # fmt: skip
 """Packages whose versions matter, by their names on PyPI."""
 

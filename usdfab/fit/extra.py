@@ -1,0 +1,16 @@
+"""The optional packages of the optimisation stages, asked for before they are imported."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from usdfab.errors import UsdfabError
+
+PACKAGES = ("torch", "safetensors")
+
+
+def require_fit_extra(what: str) -> None:
+    """Raise one clear line where torch or safetensors is not installed; ``what`` needs them. Imports neither."""
+    missing = [name for name in PACKAGES if find_spec(name) is None]
+    if missing:
+        raise UsdfabError(f"{what} needs {' and '.join(missing)}", remedy="pip install 'usdfab[fit]'")
