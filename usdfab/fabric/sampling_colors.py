@@ -19,11 +19,11 @@ STRIPE_CELLS = 900
 
 def sample_color(rng: np.random.Generator) -> Color:
     """A fiber albedo coefficient: what cloth is dyed, not uniform in the cube."""
-    kind = rng.choice(["white", "natural", "grey", "vivid", "dark", "any"], p=[0.16, 0.14, 0.12, 0.28, 0.18, 0.12])
+    kind = rng.choice(["white", "natural", "grey", "vivid", "dark", "any"], p=[0.13, 0.15, 0.13, 0.24, 0.25, 0.1])
     if kind == "any":
         return _color(rng.uniform(0.0, 1.0, 3))
     if kind == "vivid":
-        return _hsv(rng.random(), rng.uniform(0.5, 1.0), rng.uniform(0.3, 1.0))
+        return _hsv(rng.random(), rng.uniform(0.4, 0.9), rng.uniform(0.3, 0.9))
     if kind == "dark":
         return _hsv(rng.random(), rng.uniform(0.0, 0.8), rng.uniform(0.05, 0.35))
     if kind == "grey":

@@ -1,7 +1,7 @@
 """Random fabrics as microscope photos of real cloth show them: the second distribution beside Table 4.
 
 Table 4 of Li et al. 2024 knows round, unplied, evenly closed yarns of two random colours in seven weaves. Photos show
-plied and strongly twisted yarns, fuzz, flattened and uneven yarns, open cloth, few colours, all weaves, 6 to 40 yarns
+plied and strongly twisted yarns, fuzz, flattened and uneven yarns, open cloth, few colours, all weaves, 5 to 40 yarns
 across and cells that are not square. Yarns are built by kind (spun, plied, filament), geometry by what must hold
 between the systems: crossing yarns touch, the cover says how open the cloth is. Lengths are metres, angles radians.
 """
@@ -23,7 +23,7 @@ from usdfab.fabric.weave import PAPER_WEAVES
 REVISION = 1
 """Raised whenever the same random numbers give another fabric."""
 
-COUNT_RANGE = (5.0, 44.0)
+COUNT_RANGE = (4.5, 42.0)
 """Fewest and most yarns of a system across the picture."""
 
 SIDE_RANGE = (1.5e-3, 8e-3)
@@ -43,10 +43,11 @@ _TRIES = 1000
 
 @dataclass(frozen=True)
 class _Shape:
-    """The cloth's geometry before its yarns have fibers: spacing and cover of both systems."""
+    """The cloth's geometry before its yarns have fibers: spacing of both systems, and which leave gaps."""
 
     count: dict[System, float]
     spacing: dict[System, float]
+    open: dict[System, bool]
     side: float
 
 
@@ -76,10 +77,10 @@ def sample_wide(label: str, rng: np.random.Generator) -> FabricParameters:
 
 def _draw(label: str, rng: np.random.Generator) -> FabricParameters:
     weave = sample_weave(label, rng)
-    shape = _shape(rng)
+    floats = FabricParameters(weave).float_cells()
+    shape = _shape(floats, rng)
     kind = _kind(rng)
     other_kind = kind if rng.random() < 0.75 else _kind(rng)
-    floats = FabricParameters(weave).float_cells()
     base = {"warp": _yarn(shape, "warp", kind, floats, rng)}
     if kind == other_kind and rng.random() < 0.6:
         # The same yarn in both directions, as thick; it is pressed flat by how closely it is set.
@@ -104,15 +105,24 @@ def _draw(label: str, rng: np.random.Generator) -> FabricParameters:
     )  # type: ignore[arg-type]
 
 
-def _shape(rng: np.random.Generator) -> _Shape:
+def _shape(floats: int, rng: np.random.Generator) -> _Shape:
     side = _log_uniform(rng, *SIDE_RANGE)
+    # Long floats would slip in open cloth: nobody weaves that.
+    gaps = rng.random() < (0.35 if floats < 4 else 0.1)
+    both = rng.random() < 0.6
+    one = rng.random() < 0.5
     while True:
-        mean = _log_uniform(rng, 6.5, 34.0)
+        mean = _log_uniform(rng, 5.5, 30.0)
         aspect = math.exp(np.clip(rng.normal(0.0, 0.3), -0.7, 0.7) / 2.0)
         ends, picks = mean * aspect, mean / aspect
         if all(COUNT_RANGE[0] <= n <= COUNT_RANGE[1] for n in (ends, picks)):
             break
-    return _Shape({"warp": ends, "weft": picks}, {"warp": side / ends, "weft": side / picks}, side)
+    return _Shape(
+        count={"warp": ends, "weft": picks},
+        spacing={"warp": side / ends, "weft": side / picks},
+        open={"warp": gaps and (both or one), "weft": gaps and (both or not one)},
+        side=side,
+    )
 
 
 def _kind(rng: np.random.Generator) -> str:
@@ -122,11 +132,10 @@ def _kind(rng: np.random.Generator) -> str:
 def _yarn(shape: _Shape, system: System, kind: str, floats: int, rng: np.random.Generator) -> YarnParameters:
     spacing = shape.spacing[system]
     along = shape.spacing["weft" if system == "warp" else "warp"]
-    open_cloth = rng.random() < 0.35
-    cover = rng.uniform(COVER_RANGE[0], 0.85) if open_cloth else rng.uniform(0.85, COVER_RANGE[1])
+    cover = rng.uniform(COVER_RANGE[0], 0.85) if shape.open[system] else rng.uniform(0.85, COVER_RANGE[1])
     # Long floats and untwisted filaments spread; open cloth keeps its yarns rounder.
     spread = 0.25 + 0.35 * (kind == "filament") + 0.2 * (floats >= 4)
-    flattening = float(np.clip(1.0 + abs(rng.normal(0.0, spread)) + 0.2 * (not open_cloth), *FLATTENING_RANGE))
+    flattening = float(np.clip(1.0 + abs(rng.normal(0.0, spread)) + 0.2 * (not shape.open[system]), *FLATTENING_RANGE))
     half_width = 0.5 * cover * spacing
     low, high = ANGLE_RANGES[kind]
     # On top of the yarn a fiber moves across by 2 pi alpha f e per cell, and the cell is the other spacing long.

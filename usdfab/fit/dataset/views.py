@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from usdfab.fabric import FabricParameters
 from usdfab.fibers.budget import patch_points
 from usdfab.usd.rig import PLANE_FACTOR, Rig, swatch_scene
-from usdfab.usd.scene import DomeLight, Light, Material, Mesh, PointLight, Scene
+from usdfab.usd.scene import DomeLight, Light, Material, Mesh, PointLight, Scene, SphereLight
 
 MAX_ROTATION = math.radians(6.0)
 RING_LAMPS = 8
@@ -31,13 +31,14 @@ UNIQUE_POINTS = 500_000
 class SampleView:
     """Where camera, cloth and light are.
 
-    ``rotation`` turns the cloth counter-clockwise, ``shift`` moves it afterwards. ``lamps``: point lights' positions,
-    all equally strong. ``sky``: share of the irradiance that comes evenly from above. ``backing``: reflectance of
+    ``rotation`` turns the cloth counter-clockwise, ``shift`` moves it afterwards. ``lamps``: centres
+    of spheres of ``lamp_radius`` (0: points), all equally strong. ``sky``: share of the irradiance that comes evenly from above. ``backing``: reflectance of
     paper ``backing_depth`` below the cloth; 0 is a dark room.
     """
 
     camera_height: float
     lamps: tuple[tuple[float, float, float], ...]
+    lamp_radius: float = 0.0
     rotation: float = 0.0
     shift: tuple[float, float] = (0.0, 0.0)
     sky: float = 0.0
@@ -81,6 +82,8 @@ def sample_view(fabric: FabricParameters, rng: np.random.Generator) -> SampleVie
     return SampleView(
         camera_height=camera,
         lamps=lamps,
+        # The lamps' diffusers. The lowest lamp stays above the cloth: cos(50 degrees) is 0.64.
+        lamp_radius=float(distance * rng.uniform(0.05, 0.25)),
         rotation=float(np.clip(rng.normal(0.0, math.radians(2.5)), -MAX_ROTATION, MAX_ROTATION)),
         shift=(float(rng.uniform(0.0, ends * fabric.cell[0])), float(rng.uniform(0.0, picks * fabric.cell[1]))),
         sky=float(rng.uniform(0.1, 0.9)) if rng.random() < 0.4 else 0.0,
@@ -135,15 +138,20 @@ def _lights(view: SampleView) -> tuple[Light, ...]:
     distance = np.linalg.norm(places, axis=1)
     per_intensity = float((places[:, 2] / distance**3).sum())
     intensity = np.full(3, math.pi * (1.0 - view.sky) / per_intensity)
-    lights: tuple[Light, ...] = tuple(
-        PointLight(f"/Rig/Lamp{k}", place, intensity) for k, place in enumerate(places)
-    )
+    lights: tuple[Light, ...] = tuple(_lamp(f"/Rig/Lamp{k}", place, view, intensity) for k, place in enumerate(places))
     if view.sky > 0.0:
         # The pole of the dome is up (+z); its lower half is dark, since gaps of the cloth show the table.
         to_world = np.eye(4)
         to_world[:3, :3] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
         lights += (DomeLight("/Rig/Sky", to_world, np.full(3, view.sky), _sky()),)
     return lights
+
+
+def _lamp(path: str, place: NDArray, view: SampleView, intensity: NDArray) -> Light:
+    if view.lamp_radius == 0.0:
+        return PointLight(path, place, intensity)
+    # Seen as a disc pi r^2 of this radiance; the irradiance of a sphere above the horizon is that of a point.
+    return SphereLight(path, place, view.lamp_radius, intensity / (math.pi * view.lamp_radius**2))
 
 
 def _sky() -> NDArray[np.float32]:
