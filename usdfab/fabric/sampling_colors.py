@@ -13,7 +13,7 @@ from usdfab.srgb import srgb_to_linear
 LOWEST, HIGHEST = 0.004, 0.985
 """Fiber albedo coefficients stay within: blacker than black dye and whiter than bleached cotton is not found."""
 
-STRIPE_CELLS = 900
+STRIPE_CELLS = 400
 """Most crossings in the repeat of a yarn-dyed cloth."""
 
 
