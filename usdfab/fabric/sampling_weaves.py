@@ -84,9 +84,9 @@ def random_draft(rng: np.random.Generator) -> Weave:
         steps = rng.choice([-2, -1, 0, 1, 2], size=ends, p=[0.1, 0.3, 0.15, 0.35, 0.1])
         matrix = np.stack([np.roll(row, shift) for shift in np.cumsum(steps)])
         flips = rng.random(ends) < rng.uniform(0.0, 0.3)
-        matrix = np.where(flips[:, None], ~matrix, matrix).astype(np.uint8)
-        if max(_longest_float(m) for m in (matrix, matrix.T)) <= LONGEST_FLOAT:
-            return Weave(matrix, "draft")
+        drawn = np.where(flips[:, None], ~matrix, matrix).astype(np.uint8)
+        if max(_longest_float(m) for m in (drawn, drawn.T)) <= LONGEST_FLOAT:
+            return Weave(drawn, "draft")
 
 
 def _longest_float(matrix: NDArray[np.uint8]) -> int:

@@ -97,12 +97,9 @@ def _draw(label: str, rng: np.random.Generator) -> FabricParameters:
     apart = rng.uniform(0.75, 1.15) * sum(radii.values())
     share = rng.uniform(0.2, 0.8)
     crimp = {"warp": apart * share / radii["warp"], "weft": apart * (1.0 - share) / radii["weft"]}
-    yarns: dict[System, YarnParameters] = {}
-    for system, yarn in base.items():
-        yarns[system] = replace(yarn, crimp=float(np.clip(crimp[system], 0.1, 1.9)))  # type: ignore[index]
-    return FabricParameters(
-        weave, (shape.side, shape.side), **yarns, seed=int(rng.integers(2**31)), name="Sampled", variants=1
-    )  # type: ignore[arg-type]
+    warp, weft = (replace(base[s], crimp=float(np.clip(crimp[s], 0.1, 1.9))) for s in ("warp", "weft"))
+    size = (shape.side, shape.side)
+    return FabricParameters(weave, size, warp, weft, int(rng.integers(2**31)), "Sampled", variants=1)
 
 
 def _shape(floats: int, rng: np.random.Generator) -> _Shape:
@@ -142,19 +139,19 @@ def _yarn(shape: _Shape, system: System, kind: str, floats: int, rng: np.random.
     turns = math.tan(math.radians(rng.uniform(low, high))) * along / (2.0 * math.pi * half_width)
     hand = -1.0 if rng.random() < 0.3 else 1.0
     plies = int(rng.choice([2, 3, 4], p=[0.75, 0.17, 0.08])) if kind == "plied" else 1
-    values: dict = dict(
-        count=shape.count[system],
-        radius=half_width / flattening,
-        flattening=flattening,
-        fiber_count=round(_log_uniform(rng, 25, 120) if kind == "filament" else _log_uniform(rng, 50, 260)),
-        packing=rng.uniform(0.3, 0.6),
-        inclination=rng.uniform(0.25, 1.3),
-        twist=float(np.clip(hand * turns, -1.5, 1.5)),
-        ply_count=plies,
-        irregularity=rng.uniform(0.02, 0.15) if kind == "filament" else rng.uniform(0.1, 0.55),
-        migration=float(np.clip(rng.normal(0.75, 0.05), 0.5, 0.95)),
-        migration_rate=float(np.clip(rng.normal(0.2, 0.06), 0.02, 0.5)),
-    )
+    values: dict = {
+        "count": shape.count[system],
+        "radius": half_width / flattening,
+        "flattening": flattening,
+        "fiber_count": round(_log_uniform(rng, 25, 120) if kind == "filament" else _log_uniform(rng, 50, 260)),
+        "packing": rng.uniform(0.3, 0.6),
+        "inclination": rng.uniform(0.25, 1.3),
+        "twist": float(np.clip(hand * turns, -1.5, 1.5)),
+        "ply_count": plies,
+        "irregularity": rng.uniform(0.02, 0.15) if kind == "filament" else rng.uniform(0.1, 0.55),
+        "migration": float(np.clip(rng.normal(0.75, 0.05), 0.5, 0.95)),
+        "migration_rate": float(np.clip(rng.normal(0.2, 0.06), 0.02, 0.5)),
+    }
     if plies > 1:
         # Between plies whose fibers lie along the yarn (-twist) and plies that are hardly twisted.
         values["ply_twist"] = -values["twist"] * rng.uniform(0.2, 1.2)

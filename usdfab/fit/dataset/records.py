@@ -54,9 +54,7 @@ def sample_of(record: dict[str, Any], place: str = "") -> Sample:
         if record["schema"] != SCHEMA:
             raise UsdfabError(f"has format {record['schema']!r}, not {SCHEMA!r}", place=place)
         fabric = fabric_from_table(record["fabric"])
-        return Sample(
-            int(record["index"]), record["prior"], record["class"], fabric, view_from_table(record["view"])
-        )
+        return Sample(int(record["index"]), record["prior"], record["class"], fabric, view_from_table(record["view"]))
     except UsdfabError as error:
         raise UsdfabError(error.problem, place=f"{place}: {error.place}" if error.place else place) from error
     except (KeyError, TypeError, ValueError) as error:
@@ -76,7 +74,8 @@ def fabric_from_table(table: dict[str, Any]) -> FabricParameters:
     def yarn(values: dict[str, Any]) -> YarnParameters:
         return YarnParameters(**{name: values[name] for name in names})
 
-    about = {f.name: table["provenance"][f.name] for f in fields(Provenance)}
+    said = {f.name: table["provenance"][f.name] for f in fields(Provenance)}
+    about: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in said.items()}
     return FabricParameters(
         Weave.from_rows(table["weave"]["matrix"], table["weave"]["name"]),
         (table["size_m"][0], table["size_m"][1]),
@@ -84,7 +83,7 @@ def fabric_from_table(table: dict[str, Any]) -> FabricParameters:
         weft=yarn(table["weft"]),
         seed=table["seed"],
         name=table["name"],
-        provenance=Provenance(**{k: tuple(v) if isinstance(v, list) else v for k, v in about.items()}),
+        provenance=Provenance(**about),
         variants=table["variants"],
         albedo_map=table["albedo_map"],
     )

@@ -298,5 +298,3 @@ def _refused(error: OSError, path: Path) -> UsdfabError:
             remedy="make room and run the same command again; finished samples are kept",
         )  # fmt: skip
     return UsdfabError(f"cannot be written ({error.strerror or error})", place=str(path))
-
-

@@ -31,9 +31,10 @@ UNIQUE_POINTS = 500_000
 class SampleView:
     """Where camera, cloth and light are.
 
-    ``rotation`` turns the cloth counter-clockwise, ``shift`` moves it afterwards. ``lamps``: centres
-    of spheres of ``lamp_radius`` (0: points), all equally strong. ``sky``: share of the irradiance that comes evenly from above. ``backing``: reflectance of
-    paper ``backing_depth`` below the cloth; 0 is a dark room.
+    ``rotation`` turns the cloth counter-clockwise about the picture's middle, ``shift`` moves it along its own axes
+    before. ``lamps``: centres of spheres of ``lamp_radius`` (0: points), all equally strong. ``sky``: share of the
+    irradiance that comes evenly from above. ``backing``: reflectance of paper ``backing_depth`` below the cloth; 0 is
+    a dark room.
     """
 
     camera_height: float
@@ -96,7 +97,8 @@ def view_scene(fabric: FabricParameters, view: SampleView) -> Scene:
     """The scene to render; its only camera shows a square or oblong of ``fabric.size``."""
     scene = swatch_scene(unrepeated(fabric), Rig(fabric.size, view.camera_height))
     cloth = _placed(scene.meshes[0], view)
-    meshes, materials = (cloth,), scene.materials
+    meshes: tuple[Mesh, ...] = (cloth,)
+    materials = scene.materials
     if view.backing > 0.0:
         below = view.backing_depth + 2.0 * sum(y.radius * max(1.0, y.crimp) for y in (fabric.warp, fabric.weft))
         paper = replace(
