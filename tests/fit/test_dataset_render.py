@@ -93,14 +93,28 @@ def test_images_are_stored_to_a_quarter_percent(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_a_white_diffuse_sample_has_radiance_one_in_the_middle(seed: int) -> None:
     """The light of any view, checked by a surface whose radiance is known: E / pi."""
-    fabric = draw_sample("wide", seed, 0).fabric
-    view = replace(sample_view(fabric, np.random.default_rng(seed)), backing=0.0)
-    scene = view_scene(fabric, view)
-    paper = Material("/Paper", -1, np.ones(3), 1.0, 0.0, 1.0, specular_color=np.zeros(3), ior=1.0)
-    scene = replace(scene, materials=(paper,), fabrics=())
-    how = RenderSettings((9, 9), 4000, max_depth=2, region=(4, 4, 5, 5))
-    found = Tracer(scene).render(scene.cameras[0], how)
-    assert found.pixels.mean() == pytest.approx(1.0, abs=0.01 + 5 * np.sqrt(found.variance.max()))
+    sample = draw_sample("wide", 3, seed)
+    # Lamps hide some of the sky and of its light; each is looked at without the other, then both roughly.
+    lamps = replace(sample.view, sky=0.0, backing=0.0)
+    mixed = replace(lamps, sky=0.5)
+    for view, bound in ((lamps, 0.01), (replace(mixed, lamp_radius=0.0), 0.01), (mixed, 0.05)):
+        scene = view_scene(sample.fabric, view)
+        paper = Material("/Paper", -1, np.ones(3), 1.0, 0.0, 1.0, specular_color=np.zeros(3), ior=1.0)
+        scene = replace(scene, materials=(paper,), fabrics=())
+        how = RenderSettings((9, 9), 4000, max_depth=2, region=(4, 4, 5, 5), threads=1)
+        found = Tracer(scene).render(scene.cameras[0], how)
+        assert found.pixels.mean() == pytest.approx(1.0, abs=bound + 5 * float(np.sqrt(found.variance.max())))
+
+
+def test_no_lamp_stands_in_the_camera_s_view() -> None:
+    for index in range(200):
+        sample = draw_sample("wide", 4, index)
+        view, half = sample.view, np.hypot(*sample.fabric.size) / 2
+        for x, y, z in view.lamps:
+            # The view's cone at the height of the sphere's lowest point, where it is widest.
+            low = max(0.0, z - view.lamp_radius)
+            cone = half * max(0.0, 1.0 - low / view.camera_height)
+            assert view.lamp_radius == 0.0 or np.hypot(x, y) - view.lamp_radius > cone
 
 
 def test_the_cloth_is_turned_and_slides() -> None:

@@ -65,5 +65,7 @@ def encode_image(pixels: NDArray[np.float32]) -> bytes:
     codes = np.clip(pixels, 0.0, HALF_MAX / 2).astype(np.float16).view(np.uint16).astype(np.uint32)
     rounded = ((codes + step // 2) // step * step).astype(np.uint16).view(np.float16)
     with tempfile.TemporaryDirectory(prefix="usdfab-") as folder:
-        path = write_image(Path(folder) / "image.exr", rounded.astype(np.float32))
+        # The date would make the bytes differ.
+        dated = {"DateTime": "1970:01:01 00:00:00"}
+        path = write_image(Path(folder) / "image.exr", rounded.astype(np.float32), metadata=dated)
         return path.read_bytes()

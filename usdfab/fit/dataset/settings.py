@@ -13,7 +13,7 @@ from usdfab.fit.dataset.samples import CHOICES
 
 SCHEMA = "usdfab-dataset/1"
 
-RENDER_REVISION = 1
+RENDER_REVISION = 2
 """Raised whenever the same sample gives another picture."""
 
 MAX_DEPTH = 64

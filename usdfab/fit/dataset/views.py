@@ -83,14 +83,22 @@ def sample_view(fabric: FabricParameters, rng: np.random.Generator) -> SampleVie
     return SampleView(
         camera_height=camera,
         lamps=lamps,
-        # The lamps' diffusers. The lowest lamp stays above the cloth: cos(50 degrees) is 0.64.
-        lamp_radius=float(distance * rng.uniform(0.05, 0.25)),
+        lamp_radius=min(distance * float(rng.uniform(0.05, 0.25)), _room(fabric, camera, side, height, count)),
         rotation=float(np.clip(rng.normal(0.0, math.radians(2.5)), -MAX_ROTATION, MAX_ROTATION)),
         shift=(float(rng.uniform(0.0, ends * fabric.cell[0])), float(rng.uniform(0.0, picks * fabric.cell[1]))),
         sky=float(rng.uniform(0.1, 0.9)) if rng.random() < 0.4 else 0.0,
         backing=backing,
         backing_depth=float(rng.uniform(1.0, 5.0)) * max(fabric.cell) if backing else 0.0,
     )
+
+
+def _room(fabric: FabricParameters, camera: float, side: float, height: float, count: int) -> float:
+    """Largest radius of lamps that neither stand in the camera's view nor before each other; 0 where there is none."""
+    view = math.hypot(*fabric.size) / 2.0 * max(0.0, 1.0 - height / camera)
+    # Half of what would touch: lamps must not hide each other or much of the sky.
+    beside = 0.5 * side * math.sin(math.pi / count) if count > 1 else math.inf
+    # A lamp above the camera hangs lower by its radius; a tenth is left over.
+    return 0.9 * max(0.0, min((side - view) / 1.5, beside, height / 2.0))
 
 
 def view_scene(fabric: FabricParameters, view: SampleView) -> Scene:
