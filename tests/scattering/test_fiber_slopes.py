@@ -234,8 +234,3 @@ def test_edges_are_finite():
                         assert np.isfinite(value).all() and np.isfinite(slopes).all()
                     for u in (np.zeros(4), np.full(4, 1.0 - 1e-16), np.full(4, 0.5)):
                         assert np.isfinite(_lobe(p, g, h, theta_o, u)[0]).all()
-
-
-def test_layout_is_shared():
-    assert len(fiber_numba_grad.NO_SLOPES) == fiber_numba_grad.PREPARED_SLOPES
-    assert fiber_numba.FIBER_SIZE == 25

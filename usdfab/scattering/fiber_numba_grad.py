@@ -47,7 +47,6 @@ from usdfab.scattering.fiber_numba import (
 from usdfab.scattering.roughness import absorption_from_albedo, azimuthal_scale, lobe_variances
 
 __all__ = [
-    "NO_SLOPES",
     "PREPARED_SLOPES",
     "SLOPES_SIZE",
     "eval_fiber_slopes",
@@ -61,7 +60,6 @@ SLOPES_SIZE = 11
 """Length of the array that ``pack_slopes`` returns."""
 PREPARED_SLOPES = 8
 """Length of the tuple that ``prepare_slopes`` returns."""
-NO_SLOPES = (0.0,) * PREPARED_SLOPES
 
 # Layout of the packed slopes `g`.
 _V_BY_M = 0  # d ln v / d gamma_M
