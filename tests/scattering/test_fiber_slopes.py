@@ -38,7 +38,12 @@ def _lobe(p, g, h, theta_o, u):
     prep = prepare_fiber(p, h, math.sin(theta_o), math.cos(theta_o))
     slopes = prepare_slopes(p, prep, h, math.cos(theta_o))
     sin_ti, cos_ti, phi, wr, wg, wb = sample_fiber_lobe(p, prep, u[0], u[1], u[2], u[3])
-    return lobe_slopes(p, g, prep, slopes, u[0], sin_ti, cos_ti, phi), (sin_ti, cos_ti, phi), (wr, wg, wb)
+    a, d = lobe_slopes(p, g, prep, slopes, u[0], sin_ti, cos_ti, phi)
+    both = (
+        a[0], a[1], a[2], d[0], d[0], d[0], a[3] + d[1], a[4] + d[1], a[5] + d[1], d[2], d[2], d[2],
+        a[6] + d[3], a[7] + d[3], a[8] + d[3], *d,
+    )  # fmt: skip
+    return both, (sin_ti, cos_ti, phi), (wr, wg, wb)
 
 
 def arguments(fiber: Fiber) -> tuple:
@@ -180,8 +185,12 @@ def _integral(p, g, h, theta_o, theta, w_theta, phi, w_phi):
 
 @njit(cache=True)
 def _sampled(p, g, h, theta_o, numbers):
-    """Means over draws of weight times derivative times two functions of the direction, and of the squares."""
+    """Means over draws of weight times derivative times two functions of the direction, and their standard errors.
+
+    Then those of the directions' own scores.
+    """
     mean, square = np.zeros((2, 15)), np.zeros((2, 15))
+    score, own = np.zeros(4), np.zeros(4)
     for k in range(len(numbers)):
         d, (sin_ti, _cos_ti, phi), w = _lobe(p, g, h, theta_o, numbers[k])
         for j in range(15):
@@ -189,8 +198,11 @@ def _sampled(p, g, h, theta_o, numbers):
                 x = w[j % 3] * d[j] * ((1.0 + sin_ti) if m == 0 else math.cos(phi))
                 mean[m, j] += x
                 square[m, j] += x * x
+        for j in range(4):
+            score[j] += d[15 + j]
+            own[j] += d[15 + j] ** 2
     n = len(numbers)
-    return mean / n, np.sqrt((square / n - (mean / n) ** 2) / n)
+    return mean / n, np.sqrt((square / n - (mean / n) ** 2) / n), score / n, np.sqrt(own) / n
 
 
 @njit(cache=True)
@@ -215,11 +227,13 @@ def test_slopes_of_single_lobes_have_the_mean_of_all(fiber, h, theta_o):
     """Draws of one lobe with its own slopes give the derivative of integrals over all directions."""
     p, g = tuple(fiber.packed), tuple(pack_slopes(*arguments(fiber)))
     numbers = np.random.default_rng(1).random((1_000_000, 4))
-    mean, error = _sampled(p, g, h, theta_o, numbers)
+    mean, error, score, doubt = _sampled(p, g, h, theta_o, numbers)
     theta, phi = checks.lobe_edges(fiber, h, theta_o)
     exact = _exact(p, g, h, theta_o, *checks._composite_gauss(theta), *checks._composite_gauss(phi))
     assert np.all(abs(mean - exact) < 4.5 * error + 1e-5), (abs(mean - exact) / error).max()
     assert error.max() < 0.03 * abs(exact).max()
+    # Densities stay densities: their logarithms' derivatives are 0 in the mean.
+    assert np.all(abs(score) < 4.5 * doubt + 1e-9), score / doubt
 
 
 def test_edges_are_finite():

@@ -233,8 +233,11 @@ def lobe_slopes(p, g, prep, slopes, u0, sin_ti, cos_ti, phi):
 
     Returns
     -------
-    tuple of 15 float
-        d ln(A M D) in each of red, green, blue by: the channel's own C; gamma_M; gamma_N; gamma_M0; eta.
+    attenuation: tuple of 9 float
+        d ln A in red, green, blue by: the channel's own C; gamma_N (through sigma); eta.
+    direction: tuple of 4 float
+        d ln(M D), the same in all channels, by gamma_M, gamma_N, gamma_M0, eta. Over the directions that the lobe
+        draws their mean is 0.
     """
     sin_o, cos_o, k, crossings = prep[6], prep[7], 2, 0.0
     by_m = by_n = by_m0 = by_phi = phi_slope = by_f = 0.0
@@ -261,21 +264,17 @@ def lobe_slopes(p, g, prep, slopes, u0, sin_ti, cos_ti, phi):
         by_m0 = m * g[_V_BY_M0]
     else:
         by_m = m * g[_V_BY_M]
-    by_n *= g[_S_BY_N]
-    by_eta = by_phi * phi_slope + by_f
     # F T of the rest's sum: its share beyond three crossings grows with F too.
     more = slopes[2] if crossings == 3.0 else 0.0
     length, length_slope = slopes[0], slopes[1]
     n_r, n_g, n_b = p[_SIGMA] * g[_SIGMA_BY_N], p[_SIGMA + 1] * g[_SIGMA_BY_N], p[_SIGMA + 2] * g[_SIGMA_BY_N]
     return (
         _by_albedo(p, g, 0, -s_r * length), _by_albedo(p, g, 1, -s_g * length), _by_albedo(p, g, 2, -s_b * length),
-        by_m, by_m, by_m,
-        by_n - s_r * length * n_r, by_n - s_g * length * n_g, by_n - s_b * length * n_b,
-        by_m0, by_m0, by_m0,
-        by_eta - s_r * length_slope * p[_SIGMA] + more * (s_r - 3.0),
-        by_eta - s_g * length_slope * p[_SIGMA + 1] + more * (s_g - 3.0),
-        by_eta - s_b * length_slope * p[_SIGMA + 2] + more * (s_b - 3.0),
-    )  # fmt: skip
+        -s_r * length * n_r, -s_g * length * n_g, -s_b * length * n_b,
+        by_f - s_r * length_slope * p[_SIGMA] + more * (s_r - 3.0),
+        by_f - s_g * length_slope * p[_SIGMA + 1] + more * (s_g - 3.0),
+        by_f - s_b * length_slope * p[_SIGMA + 2] + more * (s_b - 3.0),
+    ), (by_m, by_n * g[_S_BY_N], by_m0, by_phi * phi_slope)  # fmt: skip
 
 
 @njit(**_OPTIONS)

@@ -54,6 +54,9 @@ class DifferentiableTracer:
         Longest path in vertices, counted as in ``RenderSettings``.
     fabric:
         Which of ``scene.fabrics``.
+    keep:
+        In [0, 1]. 1: gradients without bias. Less: the influence of a scattered direction on light that comes n vertices
+        later counts keep^(n-1) only, which takes most of the noise from the derivatives by roughness and index.
     threads:
         None: all cores. Results are the same bits for any number.
 
@@ -78,13 +81,17 @@ class DifferentiableTracer:
         *,
         max_depth: int = 64,
         fabric: int = 0,
+        keep: float = 1.0,
         threads: int | None = None,
     ) -> None:
         if min(size) < 1 or max_depth < 1:
             raise UsdfabError(f"size {size} and depth {max_depth} must be at least 1")
         if not 0 <= fabric < len(scene.fabrics):
             raise UsdfabError(f"the scene has {len(scene.fabrics)} fabrics, none is number {fabric}", place=scene.path)
+        if not 0.0 <= keep <= 1.0:
+            raise UsdfabError(f"got {keep}, expected a number in [0, 1]", place="keep", remedy="1 gives no bias")
         self.size = size
+        self.keep = float(keep)
         self.max_depth = max_depth
         self.fabric = scene.fabrics[fabric].fabric
         self.optics = optics_of(self.fabric)
@@ -121,7 +128,7 @@ class DifferentiableTracer:
         image = np.zeros((self.size[1], self.size[0], 3))
         for (x0, y0, x1, y1), part in self._tiles(tile):
             image[y0:y1, x0:x1] = part
-        return self._gain / spp * image
+        return self._gain * (image / spp)
 
     def gradient(self, optics: Optics | ArrayLike, adjoint: ArrayLike, spp: int, seed: int) -> Floats:
         """(3 K + 8,) derivatives of the sum of ``adjoint`` times image by the entries of ``Optics.vector``.
@@ -171,11 +178,11 @@ class DifferentiableTracer:
             total += part
         scale = self._gain / spp
         colors = len(self.optics.albedo)
-        return scale * image, scale * np.concatenate([total[:colors].ravel(), _shared_order(total[colors:].sum(axis=1))])
+        return self._gain * (image / spp), scale * np.concatenate(
+            [total[:colors].ravel(), _shared_order(total[colors:].sum(axis=1))]
+        )
 
-    def gradient_images(
-        self, optics: Optics | ArrayLike, spp: int, seed: int, block: int = 1
-    ) -> tuple[Floats, Floats]:
+    def gradient_images(self, optics: Optics | ArrayLike, spp: int, seed: int, block: int = 1) -> tuple[Floats, Floats]:
         """The picture and its derivative by each parameter: the Jacobian, for a look and for Gauss-Newton steps.
 
         Noise counts twice in J^T J, which comes out too large: the product of two Jacobians of different seeds does
@@ -195,7 +202,9 @@ class DifferentiableTracer:
         """
         width, height = self.size
         if block < 1 or width % block or height % block:
-            raise UsdfabError(f"blocks of {block} pixels do not fill {width} x {height}", remedy="give a common divisor")
+            raise UsdfabError(
+                f"blocks of {block} pixels do not fill {width} x {height}", remedy="give a common divisor"
+            )
         sample = self._sampler(self._layout(optics), spp, seed)
         groups = tape_size(len(self.optics.albedo)) // 3
         image = np.zeros((height // block, width // block, 3))
@@ -228,7 +237,17 @@ class DifferentiableTracer:
         def tile(window: Window) -> tuple[Floats, Floats]:
             film, sums = _zeros(window, CHANNELS), _zeros(window, tape_size(len(optics.albedo)))
             gradient_tile(
-                world, self._view, np.uint64(seed), window, spp, self.max_depth, slopes, self._owners, film, sums
+                world,
+                self._view,
+                np.uint64(seed),
+                window,
+                spp,
+                self.max_depth,
+                slopes,
+                self._owners,
+                self.keep,
+                film,
+                sums,
             )
             return film[..., RGB : RGB + 3], sums
 

@@ -36,7 +36,7 @@ from usdfab.tracer.intrinsics import KERNEL, NG, PRIM, U, borrow, new_ray_buffer
 from usdfab.tracer.lights import FAR, escaped_radiance, hit_light, light_blocks, sample_light
 from usdfab.tracer.slab import HIT, enter_slab, inverse_columns, leave_slab, slab_occluded, to_patch, trace_slab
 from usdfab.tracer.surfaces import MAX_SURFACES, surface_frame, trace_macro, transmittance
-from usdfab.tracer.tape import start_tape, tape_direct, tape_direction, tape_light, tape_lobe
+from usdfab.tracer.tape import start_tape, tape_direct, tape_light, tape_scatter
 from usdfab.tracer.textures import normal_at, opacity_at, surface_at
 from usdfab.tracer.vertex import camera_sample, pixel_shift, shading_frame, tint_at, tint_fiber, to_local
 from usdfab.tracer.world import ALBEDO_MAP, FIRST_CURVE, FIRST_PATCH, FIRST_SEGMENT, MATERIAL, YARN, borrowed
@@ -62,7 +62,7 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
     """Radiance along a camera ray. Adds to ``out``, the film's channels of the pixel.
 
     With a ``Tape`` it adds derivatives to that; with None Numba leaves all of that out of what it compiles. The path is
-    the same either way.
+    the same either way; with lamps that have an extent its weights are not, but in the mean.
     """
     macro, patches, lights = world.macro, world.patches, world.lights
     light_count = len(lights.table)
@@ -315,12 +315,13 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
             if lights.deltas:
                 sin_ti, cos_ti, phi, wr, wg, wb = sample_fiber_lobe(fiber_material, prepared, u0, u1, u2, u3)
                 bsdf_pdf = 1.0
-                if tape is not None:
-                    tape_lobe(tape, row, fiber_material, prepared, slopes, u0, sin_ti, cos_ti, phi)
             else:
                 sin_ti, cos_ti, phi, wr, wg, wb, bsdf_pdf = sample_fiber(fiber_material, prepared, u0, u1, u2, u3)
                 if tape is not None:
-                    tape_direction(tape, row, fiber_material, prepared, slopes, sin_ti, cos_ti, phi)
+                    # The same direction, weighed as the tape knows it.
+                    _s, _c, _p, wr, wg, wb = sample_fiber_lobe(fiber_material, prepared, u0, u1, u2, u3)
+            if tape is not None:
+                tape_scatter(tape, row, fiber_material, prepared, slopes, u0, sin_ti, cos_ti, phi)
             dx, dy, dz = fiber_direction(ax, ay, az, ex, ey, ez, fx, fy, fz, sin_ti, cos_ti, phi)
         else:
             qx, qy, qz, wr, wg, wb, bsdf_pdf = sample_surface(surface, wox, woy, woz, u0, u1, u2)
