@@ -12,7 +12,7 @@ from numba import njit
 from scattering_checks import Fiber
 from scipy import special
 
-from usdfab.scattering import fiber_numba, fiber_numba_grad, roughness
+from usdfab.scattering import fiber_numba_grad, roughness
 from usdfab.scattering.fiber_numba import eval_fiber, pack_fiber, prepare_fiber, sample_fiber_lobe
 from usdfab.scattering.fiber_numba_grad import eval_fiber_slopes, lobe_slopes, pack_slopes, prepare_slopes
 

@@ -55,8 +55,9 @@ class DifferentiableTracer:
     fabric:
         Which of ``scene.fabrics``.
     keep:
-        In [0, 1]. 1: gradients without bias. Less: the influence of a scattered direction on light that comes n vertices
-        later counts keep^(n-1) only, which takes most of the noise from the derivatives by roughness and index.
+        In [0, 1]. 1: gradients without bias. Less: the influence of a scattered direction on light that comes n
+        vertices later counts keep^(n-1) only, which takes most of the noise from the derivatives by roughness and
+        index.
     threads:
         None: all cores. Results are the same bits for any number.
 
@@ -153,9 +154,9 @@ class DifferentiableTracer:
     def image_and_gradient(
         self, optics: Optics | ArrayLike, adjoint: ArrayLike, spp: int, seed: int
     ) -> tuple[Floats, Floats]:
-        """The picture (H, W, 3) that ``render`` gives for this seed, for nothing, and ``gradient`` by the same paths.
+        """The picture (H, W, 3) that ``render`` gives for this seed, at no cost, and ``gradient`` by the same paths.
 
-        The picture is for a look or for the *next* step's statistics: the adjoint must not come from it.
+        The adjoint must not come from this picture. With lamps that have an extent the two pictures agree in the mean.
         """
         weights = np.asarray(adjoint, dtype=np.float64)
         if weights.shape != (self.size[1], self.size[0], 3) or not np.isfinite(weights).all():

@@ -3,12 +3,12 @@
 A path's light is a product of what its vertices scatter, so its derivative is that light times a sum of logarithmic
 derivatives, the *score*: one addition per vertex, no second pass, nothing kept of the path. Directions are drawn from
 densities that do not move with the parameters (detached sampling); so does Russian roulette end paths. What is
-differentiated is the one lobe that was drawn, A M D: its attenuation goes into ``score``, the rest, which does not depend
-on colour and is 0 in the mean, into ``drift``.
+differentiated is the one lobe that was drawn, A M D: its attenuation goes into ``score``, the rest, which does not
+depend on colour and is 0 in the mean, into ``drift``.
 
 Most of the noise is the drift's: light that comes many vertices later hardly depends on a direction any more, but is
-multiplied by its score all the same. ``keep`` below 1 lets the drift fade by this factor at each further vertex: a little
-bias for much less noise.
+multiplied by its score all the same. ``keep`` below 1 lets the drift fade by this factor at each further vertex: a
+little bias for much less noise.
 
 Layout of ``score`` and ``sums``, the same for all: colour k of the fabric has three entries from 3 k on, its albedo in
 red, green, blue, each of which changes only its own channel of the picture. Then each of the two yarn systems has
