@@ -104,8 +104,8 @@ def pack_slopes(
     g[_ROOT_BY_C : _ROOT_BY_C + 3] = inverse_q / color
     v = lobe_variances(gamma_m, gamma_m0)[:3]
     # Written with e^(-x), which cannot overflow.
-    x = 2.0 / v
-    g[_M_EDGE : _M_EDGE + 3] = -x * np.exp(-x) / np.expm1(-x)
+    twice = 2.0 / v
+    g[_M_EDGE : _M_EDGE + 3] = -twice * np.exp(-twice) / np.expm1(-twice)
     x = math.pi / float(azimuthal_scale(n))
     g[_D_EDGE] = -2.0 * x * math.exp(-x) / math.expm1(-2.0 * x)
     return g
