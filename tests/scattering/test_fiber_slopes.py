@@ -92,7 +92,7 @@ def test_slopes_are_the_finite_differences_of_the_value(fiber, h, theta_o, lobe,
     place = h, theta_o, theta_i, center + off_phi * scale
     value, derivatives = _slopes(p, g, *place)
     expected = _values(p, *place)
-    # The same operations, up to how the compiler contracts them: exponents are differences of numbers as large as 1 / v.
+    # The same operations, up to how the compiler contracts them; exponents are differences of numbers of about 1 / v.
     rounding = 4.0 * np.finfo(float).eps / float(roughness.lobe_variances(fiber.gamma_m, fiber.gamma_m0).min())
     np.testing.assert_allclose(value, expected, rtol=1e-14 + rounding, atol=1e-300)
     got = np.array(derivatives).reshape(5, 3)[parameter]
