@@ -17,7 +17,7 @@ from usdfab.tracer.film import CHANNELS
 from usdfab.tracer.kernel import render_tile
 from usdfab.tracer.patch_scene import tile_copies
 from usdfab.tracer.reference import reference_fibers, trace
-from usdfab.tracer.render import _view
+from usdfab.tracer.render import pack_view
 from usdfab.usd.scene import DistantLight, PointLight, RectLight, SphereLight
 
 UP_POLE = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -211,7 +211,7 @@ def test_passes_do_not_show(sample):
     seen: list[tuple[int, int]] = []
     render = tracer.render(camera, RenderSettings((16, 16), spp=11, seed=3), lambda *at: seen.append(at))
     assert len(seen) > 2 and seen[-1][0] == seen[-1][1] and seen == sorted(seen)
-    view = _view(camera, 16, 16, False)
+    view = pack_view(camera, 16, 16, False)
     film, squares = np.zeros((16, 16, CHANNELS)), np.zeros((16, 16, 3))
     render_tile(tracer.world, view, np.uint64(3), (0, 0, 16, 16), 0, 11, 64, film, squares)
     np.testing.assert_array_equal(render.pixels, (film[..., :3] / 11).astype(np.float32))

@@ -230,6 +230,18 @@ def _cos_half_turn(u):
 
 # --- The pieces that evaluation, sampling and density share ---
 
+BESSEL_SPLIT = 5.0
+BESSEL_SMALL = (
+    *(0.9999999906144375, 0.2500000750636793, 0.015624911348234745, 0.000434064719286229),
+    *(6.7745472060247186e-06, 6.85320849661319e-08, 4.3284612068228183e-10, 3.4074463779672236e-12),
+)
+"""I0(a) below the split: least-maximum coefficients of the powers of a^2, relative error 1e-8."""
+BESSEL_LARGE = (
+    *(0.3989422883840288, 0.04986269455300198, 0.028579972217730794, 0.008627573219322504),
+    *(0.4243761206049833, -3.4661366494266534, 16.365955390366384, -26.137822445613317),
+)
+"""I0(a) e^-a sqrt(a) above it: of the powers of 1 / a, relative error 2e-8."""
+
 
 @njit(**_OPTIONS)
 def _longitudinal(scale, inv_v, sin_i, cos_i, sin_o, cos_o):
@@ -239,24 +251,26 @@ def _longitudinal(scale, inv_v, sin_i, cos_i, sin_o, cos_o):
     1 / (2 v sinh(1/v)) written so that nothing overflows. For large arguments a the exponential and I0(a) ~ e^a cancel:
     what stays is (cos(theta_i + theta_o) - 1) / v <= 0.
 
-    I0 is two least-maximum fits of relative error 1e-8 (a < 5, in a^2) and 2e-8 (in 1 / a); no series, no log.
+    I0 is two least-maximum fits; no series, no log.
     """
     a = cos_i * cos_o * inv_v
     b = -(1.0 + sin_i * sin_o) * inv_v
     if a + b < -_CUT:
         return 0.0
-    if a < 5.0:
+    if a < BESSEL_SPLIT:
         x = a * a
-        bessel = 4.3284612068228183e-10 + x * 3.4074463779672236e-12
-        bessel = 6.7745472060247186e-06 + x * (6.85320849661319e-08 + x * bessel)
-        bessel = 0.015624911348234745 + x * (0.000434064719286229 + x * bessel)
-        bessel = 0.9999999906144375 + x * (0.2500000750636793 + x * bessel)
+        c = BESSEL_SMALL
+        bessel = c[6] + x * c[7]
+        bessel = c[4] + x * (c[5] + x * bessel)
+        bessel = c[2] + x * (c[3] + x * bessel)
+        bessel = c[0] + x * (c[1] + x * bessel)
         return scale * _exp(b) * bessel
     x = 1.0 / a
-    bessel = 16.365955390366384 + x * -26.137822445613317
-    bessel = 0.4243761206049833 + x * (-3.4661366494266534 + x * bessel)
-    bessel = 0.028579972217730794 + x * (0.008627573219322504 + x * bessel)
-    bessel = 0.3989422883840288 + x * (0.04986269455300198 + x * bessel)
+    c = BESSEL_LARGE
+    bessel = c[6] + x * c[7]
+    bessel = c[4] + x * (c[5] + x * bessel)
+    bessel = c[2] + x * (c[3] + x * bessel)
+    bessel = c[0] + x * (c[1] + x * bessel)
     return scale * _exp(a + b) * bessel * math.sqrt(x)
 
 

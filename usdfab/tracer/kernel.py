@@ -28,14 +28,17 @@ from usdfab.scattering.fiber_numba import (
     sample_fiber,
     sample_fiber_lobe,
 )
+from usdfab.scattering.fiber_numba_grad import PREPARED_SLOPES, prepare_slopes
 from usdfab.scattering.surface_numba import PREPARED_SURFACE, eval_surface, prepare_surface, sample_surface
-from usdfab.tracer.counted import mix, next_uniform, start_stream
+from usdfab.tracer.counted import next_uniform
 from usdfab.tracer.film import ALBEDO, ALPHA, DEPTH, DIRECT, FIBER_ID, NORMAL, RAYS, SAMPLES, UV, YARN_ID
 from usdfab.tracer.intrinsics import KERNEL, NG, PRIM, U, borrow, new_ray_buffer
 from usdfab.tracer.lights import FAR, escaped_radiance, hit_light, light_blocks, sample_light
 from usdfab.tracer.slab import HIT, enter_slab, inverse_columns, leave_slab, slab_occluded, to_patch, trace_slab
 from usdfab.tracer.surfaces import MAX_SURFACES, surface_frame, trace_macro, transmittance
-from usdfab.tracer.textures import lookup, normal_at, opacity_at, surface_at
+from usdfab.tracer.tape import start_tape, tape_direct, tape_light, tape_scatter
+from usdfab.tracer.textures import normal_at, opacity_at, surface_at
+from usdfab.tracer.vertex import camera_sample, pixel_shift, shading_frame, tint_at, tint_fiber, to_local
 from usdfab.tracer.world import ALBEDO_MAP, FIRST_CURVE, FIRST_PATCH, FIRST_SEGMENT, MATERIAL, YARN, borrowed
 
 RUSSIAN_ROULETTE_DEPTH = 5
@@ -50,85 +53,17 @@ noise. So the rays that are saved here (nine of ten) cost hardly any variance.
 _NO_FIBER = (0.0,) * FIBER_SIZE
 _NOT_PREPARED = (0.0,) * PREPARED_FIBER
 _NO_SURFACE = (0.0,) * PREPARED_SURFACE
+_NO_SLOPES = (0.0,) * PREPARED_SLOPES
 """Of the right types, for variables that a fiber or a surface sets and nobody else reads."""
 
 
 @njit(**KERNEL)
-def _shading_frame(nx, ny, nz, gx, gy, gz, hx, hy, hz, mapped, mx, my, mz):
-    """Unit tangent, bitangent and normal for a surface: along the texture coordinates where a normal map needs it."""
-    norm = 1.0 / math.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-300))
-    nx, ny, nz = nx * norm, ny * norm, nz * norm
-    if mapped:
-        # dp/du and dp/dv are the dual basis of the gradients.
-        tx, ty, tz = hy * nz - hz * ny, hz * nx - hx * nz, hx * ny - hy * nx
-        bx, by, bz = ny * gz - nz * gy, nz * gx - nx * gz, nx * gy - ny * gx
-        handed = 1.0 if gx * tx + gy * ty + gz * tz > 0.0 else -1.0
-        tangent = handed / math.sqrt(max(tx * tx + ty * ty + tz * tz, 1e-300))
-        bitangent = handed / math.sqrt(max(bx * bx + by * by + bz * bz, 1e-300))
-        nx, ny, nz = (
-            mx * tangent * tx + my * bitangent * bx + mz * nx,
-            mx * tangent * ty + my * bitangent * by + mz * ny,
-            mx * tangent * tz + my * bitangent * bz + mz * nz,
-        )
-        norm = 1.0 / math.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-300))
-        nx, ny, nz = nx * norm, ny * norm, nz * norm
-    # Duff et al. 2017.
-    sign = math.copysign(1.0, nz)
-    a = -1.0 / (sign + nz)
-    b = nx * ny * a
-    return 1.0 + sign * nx * nx * a, sign * b, -sign * nx, b, sign + ny * ny * a, -ny, nx, ny, nz
+def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, set_ids, out, tape):
+    """Radiance along a camera ray. Adds to ``out``, the film's channels of the pixel.
 
-
-@njit(**KERNEL, forceinline=True)
-def _to_local(s, x, y, z):
-    return (
-        s[0] * x + s[1] * y + s[2] * z,
-        s[3] * x + s[4] * y + s[5] * z,
-        s[6] * x + s[7] * y + s[8] * z,
-    )
-
-
-@njit(**KERNEL)
-def _tint_at(world, material, prim, u, v, tx, ty):
-    """Factor of the fiber albedo from the mesh's colours and the fabric's albedo map: (r, g, b)."""
-    r = g = b = 1.0
-    macro = world.macro
-    row = macro.tinted[prim]
-    if row >= 0:
-        w = 1.0 - u - v
-        c = macro.tint
-        r = w * c[row, 0, 0] + u * c[row, 1, 0] + v * c[row, 2, 0]
-        g = w * c[row, 0, 1] + u * c[row, 1, 1] + v * c[row, 2, 1]
-        b = w * c[row, 0, 2] + u * c[row, 1, 2] + v * c[row, 2, 2]
-    image = int(macro.fabrics[material, ALBEDO_MAP])
-    if image >= 0:
-        lr, lg, lb = lookup(world.textures, image, tx, ty)
-        r, g, b = r * lr, g * lg, b * lb
-    return r, g, b
-
-
-@njit(**KERNEL, forceinline=True)
-def _absorption(sigma, inverse_q, tint, albedo):
-    """Absorption of a fiber whose albedo coefficient is multiplied by ``tint`` (Chiang et al. 2015; at most 1)."""
-    root = math.sqrt(sigma) - math.log(min(max(tint, 1e-4), 1.0 / max(albedo, 1e-4))) * inverse_q
-    return root * root if root > 0.0 else 0.0
-
-
-@njit(**KERNEL, forceinline=True)
-def _tinted(p, albedo, row, r, g, b):
-    """The packed fiber material ``p`` with its albedo coefficient multiplied."""
-    q = albedo[row, 3]
-    absorption = (
-        _absorption(p[0], q, r, albedo[row, 0]),
-        _absorption(p[1], q, g, albedo[row, 1]),
-        _absorption(p[2], q, b, albedo[row, 2]),
-    )
-    return absorption + p[3:]
-
-
-@njit(**KERNEL)
-def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, set_ids, out):
-    """Radiance along a camera ray. Adds to ``out``, the film's channels of the pixel."""
+    With a ``Tape`` it adds derivatives to that; with None Numba leaves all of that out of what it compiles. The path is
+    the same either way; with lamps that have an extent its weights are not, but in the mean.
+    """
     macro, patches, lights = world.macro, world.patches, world.lights
     light_count = len(lights.table)
     beta_r = beta_g = beta_b = 1.0
@@ -149,6 +84,8 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
     first = True
     travelled = 0.0
     tx = ty = 0.0
+    if tape is not None:
+        start_tape(tape)
 
     for depth in range(1, max_depth + 1):
         # Next interaction: a fiber, a surface, or light.
@@ -187,6 +124,8 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
             if at_light or not hit:
                 er, eg, eb = beta_r * er, beta_g * eg, beta_b * eb
                 total_r, total_g, total_b = total_r + er, total_g + eg, total_b + eb
+                if tape is not None:
+                    tape_light(tape, er, eg, eb)
                 if depth <= 2:
                     direct_r, direct_g, direct_b = direct_r + er, direct_g + eg, direct_b + eb
                 if first and at_light:
@@ -218,7 +157,7 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
             tinted, tint_r, tint_g, tint_b = False, 1.0, 1.0, 1.0
             if macro.tinted[prim] >= 0 or macro.fabrics[material, ALBEDO_MAP] >= 0.0:
                 tinted = True
-                tint_r, tint_g, tint_b = _tint_at(world, material, prim, hu, hv, tx, ty)
+                tint_r, tint_g, tint_b = tint_at(world, material, prim, hu, hv, tx, ty)
             step = t - back
             ox, oy, oz = ox + step * dx, oy + step * dy, oz + step * dz
             travelled += step
@@ -229,7 +168,8 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
 
         # Shading frame at the interaction.
         floats, words, _address = buffer
-        fiber_material, prepared, surface = _NO_FIBER, _NOT_PREPARED, _NO_SURFACE
+        fiber_material, prepared, surface, slopes = _NO_FIBER, _NOT_PREPARED, _NO_SURFACE, _NO_SLOPES
+        row = nowhere
         shading = m
         ax = ay = az = ex = ey = ez = fx = fy = fz = 0.0
         wox = woy = woz = 0.0
@@ -260,9 +200,11 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
             nx, ny, nz = nx * norm, ny * norm, nz * norm
             fiber_material = load_fiber(patches.materials, row)
             if tinted:
-                fiber_material = _tinted(fiber_material, patches.albedo, row, tint_r, tint_g, tint_b)
+                fiber_material = tint_fiber(fiber_material, patches.albedo, row, tint_r, tint_g, tint_b)
             sin_to, cos_to, h, ex, ey, ez, fx, fy, fz = fiber_frame(ax, ay, az, nx, ny, nz, -dx, -dy, -dz)
             prepared = prepare_fiber(fiber_material, h, sin_to, cos_to)
+            if tape is not None:
+                slopes = prepare_slopes(fiber_material, prepared, h, cos_to)
             if first:
                 out[ALBEDO] += min(tint_r * patches.albedo[row, 0], 1.0)
                 out[ALBEDO + 1] += min(tint_g * patches.albedo[row, 1], 1.0)
@@ -276,18 +218,20 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
             side = 1.0 if dx * gx + dy * gy + dz * gz < 0.0 else -1.0
             er, eg, eb = beta_r * er, beta_g * eg, beta_b * eb
             total_r, total_g, total_b = total_r + er, total_g + eg, total_b + eb
+            if tape is not None:
+                tape_light(tape, er, eg, eb)
             if depth <= 2:
                 direct_r, direct_g, direct_b = direct_r + er, direct_g + eg, direct_b + eb
             gx, gy, gz = side * gx, side * gy, side * gz
-            shading = _shading_frame(
+            shading = shading_frame(
                 side * frame[0], side * frame[1], side * frame[2], frame[3], frame[4], frame[5], frame[6], frame[7],
                 frame[8], mapped, side * qx, side * qy, qz,
             )  # fmt: skip
-            wox, woy, woz = _to_local(shading, -dx, -dy, -dz)
+            wox, woy, woz = to_local(shading, -dx, -dy, -dz)
             if woz <= 1e-4:
                 # The interpolated normal looks away: the triangle's own does not.
-                shading = _shading_frame(gx, gy, gz, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, False, 0.0, 0.0, 1.0)
-                wox, woy, woz = _to_local(shading, -dx, -dy, -dz)
+                shading = shading_frame(gx, gy, gz, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, False, 0.0, 0.0, 1.0)
+                wox, woy, woz = to_local(shading, -dx, -dy, -dz)
             nx, ny, nz = shading[6], shading[7], shading[8]
             surface = prepare_surface(packed, max(woz, 1e-4))
             # Embree's single precision counts from the world's origin.
@@ -315,7 +259,7 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                     sin_ti, cos_ti, phi = fiber_angles(ax, ay, az, ex, ey, ez, fx, fy, fz, wx, wy, wz)
                     fr, fg, fb, pdf = eval_fiber(fiber_material, prepared, sin_ti, cos_ti, phi)
                 else:
-                    qx, qy, qz = _to_local(shading, wx, wy, wz)
+                    qx, qy, qz = to_local(shading, wx, wy, wz)
                     fr, fg, fb, pdf = eval_surface(surface, qx, qy, qz, wox, woy, woz)
                     if wx * gx + wy * gy + wz * gz <= 0.0:
                         fr = fg = fb = 0.0
@@ -353,6 +297,11 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                         share = transmittance(world, buffer, time, ox, oy, oz, wx, wy, wz, near, reach, nowhere, 0.0)
                     cr, cg, cb = share * cr, share * cg, share * cb
                     total_r, total_g, total_b = total_r + cr, total_g + cg, total_b + cb
+                    if tape is not None:
+                        tape_light(tape, cr, cg, cb)
+                        if fiber:
+                            sin_ti, cos_ti, phi = fiber_angles(ax, ay, az, ex, ey, ez, fx, fy, fz, wx, wy, wz)
+                            tape_direct(tape, row, fiber_material, prepared, slopes, sin_ti, cos_ti, phi, cr, cg, cb)
                     if depth == 1:
                         direct_r, direct_g, direct_b = direct_r + cr, direct_g + cg, direct_b + cb
 
@@ -368,6 +317,11 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
                 bsdf_pdf = 1.0
             else:
                 sin_ti, cos_ti, phi, wr, wg, wb, bsdf_pdf = sample_fiber(fiber_material, prepared, u0, u1, u2, u3)
+                if tape is not None:
+                    # The same direction, weighed as the tape knows it.
+                    _s, _c, _p, wr, wg, wb = sample_fiber_lobe(fiber_material, prepared, u0, u1, u2, u3)
+            if tape is not None:
+                tape_scatter(tape, row, fiber_material, prepared, slopes, u0, sin_ti, cos_ti, phi)
             dx, dy, dz = fiber_direction(ax, ay, az, ex, ey, ez, fx, fy, fz, sin_ti, cos_ti, phi)
         else:
             qx, qy, qz, wr, wg, wb, bsdf_pdf = sample_surface(surface, wox, woy, woz, u0, u1, u2)
@@ -394,36 +348,6 @@ def _trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, 
     return total_r, total_g, total_b
 
 
-@njit(**KERNEL)
-def _camera_ray(view, time, s, t, u1, u2):
-    """Start and direction of the ray through film position (s, t) in [-1, 1]^2, in the world."""
-    x, y = view.film[0] * (s + view.film[2]), view.film[1] * (t + view.film[3])
-    ox = oy = 0.0
-    z = -1.0
-    if view.lens[0] > 0.0:
-        radius, phi = view.lens[0] * math.sqrt(u1), 2.0 * math.pi * u2
-        ox, oy = radius * math.cos(phi), radius * math.sin(phi)
-        x, y, z = view.lens[1] * x - ox, view.lens[1] * y - oy, -view.lens[1]
-    norm = 1.0 / math.sqrt(x * x + y * y + z * z)
-    x, y, z = x * norm, y * norm, z * norm
-    m = view.to_world
-    a, b = (1.0 - time, time) if view.moves else (1.0, 0.0)
-    px, py, pz = a * m[0, 0, 3] + b * m[1, 0, 3], a * m[0, 1, 3] + b * m[1, 1, 3], a * m[0, 2, 3] + b * m[1, 2, 3]
-    dx = dy = dz = 0.0
-    for k in range(2):
-        w = a if k == 0 else b
-        if w == 0.0:
-            continue
-        dx += w * (m[k, 0, 0] * x + m[k, 0, 1] * y + m[k, 0, 2] * z)
-        dy += w * (m[k, 1, 0] * x + m[k, 1, 1] * y + m[k, 1, 2] * z)
-        dz += w * (m[k, 2, 0] * x + m[k, 2, 1] * y + m[k, 2, 2] * z)
-        px += w * (m[k, 0, 0] * ox + m[k, 0, 1] * oy)
-        py += w * (m[k, 1, 0] * ox + m[k, 1, 1] * oy)
-        pz += w * (m[k, 2, 0] * ox + m[k, 2, 1] * oy)
-    norm = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
-    return px, py, pz, dx * norm, dy * norm, dz * norm
-
-
 @njit(**KERNEL, nogil=True)
 def render_tile(world, view, seed, window, first_sample, samples, max_depth, film, squares):
     """Add samples to the pixels of ``window`` (x0, y0, x1, y1).
@@ -440,34 +364,18 @@ def render_tile(world, view, seed, window, first_sample, samples, max_depth, fil
     squares: (y1 - y0, x1 - x0, 3)
         Sums of the squares of RGB.
     """
-    width, height = view.width, view.height
     memory = new_ray_buffer(world.embree[2])
     buffer = (borrow(memory[0]), borrow(memory[1]), memory[2])
     world = borrowed(world)
     for row in range(window[1], window[3]):
         for column in range(window[0], window[2]):
-            pixel = row * width + column
-            # Places in the pixel: the R2 sequence (Roberts 2018), shifted by a hash of the pixel.
-            shift = mix(np.uint64(pixel) + mix(np.uint64(seed)))
-            shift_x = np.float64(shift >> np.uint64(40)) * 2.0**-24
-            shift_y = np.float64((shift >> np.uint64(16)) & np.uint64(0xFFFFFF)) * 2.0**-24
+            shift_x, shift_y = pixel_shift(seed, row * view.width + column)
             out = borrow(film[row - window[1], column - window[0]])
             square = borrow(squares[row - window[1], column - window[0]])
             for sample in range(first_sample, first_sample + samples):
-                jx = shift_x + 0.7548776662466927 * (sample + 1)
-                jy = shift_y + 0.5698402909980532 * (sample + 1)
-                s = 2.0 * (column + jx - math.floor(jx)) / width - 1.0
-                t = 1.0 - 2.0 * (row + jy - math.floor(jy)) / height
-                stream = start_stream(seed, pixel, sample)
-                time = u1 = u2 = 0.0
-                if view.moves:
-                    stream, time = next_uniform(stream)
-                if view.lens[0] > 0.0:
-                    stream, u1 = next_uniform(stream)
-                    stream, u2 = next_uniform(stream)
-                ox, oy, oz, dx, dy, dz = _camera_ray(view, time, s, t, u1, u2)
-                red, green, blue = _trace_path(
-                    world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, sample == 0, out
+                stream, time, ox, oy, oz, dx, dy, dz = camera_sample(view, seed, shift_x, shift_y, row, column, sample)
+                red, green, blue = trace_path(
+                    world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, sample == 0, out, None
                 )
                 out[SAMPLES] += 1.0
                 square[0] += red * red

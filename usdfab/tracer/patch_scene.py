@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.fabric import FabricParameters, YarnParameters
+from usdfab.fabric.fabric import SYSTEMS
 from usdfab.fibers import FiberSystem, OpenCurves, Patch, generate_patch, patch_variants
 from usdfab.fibers.tiles import tile_copies
 from usdfab.scattering.fiber_numba import pack_fiber
@@ -24,6 +25,9 @@ from usdfab.tracer.embree import NEIGHBOR_LEFT, NEIGHBOR_RIGHT, EmbreeScene, cur
 FIBER_RADIUS_UNITS = 0.1
 """Radius of the thinnest fiber in patch space. Embree's curve intersector has thresholds that are not relative: in
 metres, with fibers of 1e-5, it returns wrong places along the segment."""
+
+DARKEST = 1e-4
+"""Least fiber albedo coefficient: 0 would be infinitely absorbing."""
 
 BEND = 0.03
 """How far, in fiber radii, a straight segment may be from the spline: knots in between are left out. The shading frame
@@ -38,7 +42,7 @@ class PatchScene:
 
     ``segments`` (S, 8) int16, packed by ``pack_segments``; ``curves`` (curves, 2) 1 + yarn, warp first, then weft, and
     row of ``materials``; ``materials`` (M, N) packed by ``pack_fiber``; ``albedo`` (M, 4) fiber albedo coefficients and
-    1 / q(gamma_N).
+    1 / q(gamma_N); ``systems`` (M,) whose they are: 0 warp, 1 weft.
     """
 
     size: tuple[float, float]
@@ -48,6 +52,7 @@ class PatchScene:
     materials: NDArray[np.float64]
     albedo: NDArray[np.float64]
     curves: NDArray[np.int32]
+    systems: NDArray[np.int32]
     units_per_meter: float
     epsilon: float
     """Shortest ray: hits nearer than this are the surface the ray starts on."""
@@ -74,6 +79,7 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
     vertices, first, flags, segments = [], [], [], []
     curves: list[NDArray] = []
     materials: list[NDArray] = []
+    systems: list[int] = []
     albedo: list[tuple[float, ...]] = []
     base = 0
     for system in patch.curves:
@@ -87,10 +93,11 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
         first_yarn = 1 if system.system == "warp" else 2 + int(patch.warp.yarn.max())
         curves.append(np.c_[system.yarn + first_yarn, color_of_curve.reshape(-1) + len(materials)])
         base += len(v)
-        materials.extend(_pack(yarn, tuple(c)) for c in colors)
-        # What turns ln C into the root of the absorption.
-        inverse_q = float(np.sqrt(absorption_from_albedo(np.exp(-1.0), yarn.roughness_azimuthal)))
-        albedo.extend((*c, inverse_q) for c in colors)
+        for color in colors:
+            own = pack_material(yarn, tuple(color))
+            materials.append(own[0])
+            albedo.append(own[1])
+            systems.append(SYSTEMS.index(system.system))
     segment_vertex = np.concatenate(first).astype(np.int32)
     scene = curve_scene(np.concatenate(vertices), segment_vertex, np.concatenate(flags))
     low, high = patch.z_range
@@ -102,6 +109,7 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
         materials=np.stack(materials),
         albedo=np.asarray(albedo),
         curves=np.concatenate(curves).astype(np.int32),
+        systems=np.asarray(systems, dtype=np.int32),
         units_per_meter=units,
         epsilon=5e-3 * FIBER_RADIUS_UNITS,
     )
@@ -117,14 +125,25 @@ def pack_segments(start: NDArray, end: NDArray, curve: NDArray) -> NDArray[np.in
     return np.c_[tangents, np.asarray(curve, dtype="<u4").view("<i2").reshape(-1, 2)]
 
 
-def _pack(yarn: YarnParameters, color: tuple[float, ...]) -> NDArray[np.float64]:
-    return pack_fiber(
-        np.maximum(np.asarray(color, dtype=float), 1e-4),  # C = 0 would be infinitely absorbing
+def pack_material(yarn: YarnParameters, color: tuple[float, ...]) -> tuple[NDArray[np.float64], tuple[float, ...]]:
+    """Rows of ``PatchScene.materials`` and ``PatchScene.albedo`` for the yarn's fibers of one colour."""
+    packed = pack_fiber(*fiber_parameters(yarn, color))
+    # What turns ln C into the root of the absorption.
+    inverse_q = float(np.sqrt(absorption_from_albedo(np.exp(-1.0), yarn.roughness_azimuthal)))
+    return packed, (*color, inverse_q)
+
+
+def fiber_parameters(
+    yarn: YarnParameters, color: tuple[float, ...]
+) -> tuple[NDArray[np.float64], float, float, float, float, float]:
+    """The arguments of ``pack_fiber``."""
+    return (
+        np.maximum(np.asarray(color, dtype=float), DARKEST),
         yarn.roughness_longitudinal,
         yarn.roughness_azimuthal,
         yarn.roughness_primary,
-        eta=yarn.ior,
-        tilt=yarn.cuticle_tilt,
+        yarn.ior,
+        yarn.cuticle_tilt,
     )
 
 

@@ -133,6 +133,7 @@ class Tracer:
         self._tiles: list[PatchScene] = []
         tiles_of: dict[int, Tiles] = {}
         fabrics: list[FabricParameters] = []
+        owners: list[FabricParameters] = []
         tiles = []
         for surface in scene.fabrics:
             if surface.fabric not in fabrics:
@@ -140,7 +141,10 @@ class Tracer:
                 built = build_tiles(surface.fabric)
                 tiles_of[len(fabrics) - 1] = Tiles(len(self._tiles), len(built))
                 self._tiles += built
+                owners += [surface.fabric] * len(built)
             tiles.append(tiles_of[fabrics.index(surface.fabric)])
+        self.tiles: tuple[tuple[FabricParameters, PatchScene], ...] = tuple(zip(owners, self._tiles, strict=True))
+        """All tiles in the order of their materials in ``world.patches``, each with its fabric."""
         maps = [surface.albedo_map for surface in scene.fabrics]
         wanted = [t for m in scene.materials if m.fabric < 0 for t in m.textures.values()] + [m for m in maps if m]
         images, warnings = load_texture_images(wanted, strict)
@@ -180,7 +184,7 @@ class Tracer:
         film, squares = sums[..., :CHANNELS].copy(), sums[..., CHANNELS:].copy()
         close = shot.camera.to_world_close
         moves = self._moves or (close is not None and not np.array_equal(close, shot.camera.to_world))
-        view = _view(shot.camera, shot.width, shot.height, moves)
+        view = pack_view(shot.camera, shot.width, shot.height, moves)
         render_tile(self.world, view, np.uint64(shot.seed), window, first, samples, shot.max_depth, film, squares)
         return np.concatenate([film, squares], axis=-1)
 
@@ -258,7 +262,7 @@ def resolve_region(region: Window | None, width: int, height: int) -> Window:
     return x0, y0, x1, y1
 
 
-def _view(camera: Camera, width: int, height: int, moves: bool) -> View:
+def pack_view(camera: Camera, width: int, height: int, moves: bool) -> View:
     """A camera as the kernel reads it."""
     close = camera.to_world if camera.to_world_close is None else camera.to_world_close
     return View(
