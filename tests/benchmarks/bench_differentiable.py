@@ -95,9 +95,13 @@ def theirs(cloth, scene, camera, side: int, spp: tuple[int, int], variant: str):
             params[key] = type(start[key])(dr.detach(start[key]) * (1.0 - 1e-3 * (k % 2)))
             dr.make_opaque(params[key])
         params.update()
-        image = sum(
-            n * np.array(mi.render(loaded, integrator=prb, spp=n, seed=1000 * k + j)) for j, n in enumerate(split(spp[0]))
-        ) / spp[0]
+        image = (
+            sum(
+                n * np.array(mi.render(loaded, integrator=prb, spp=n, seed=1000 * k + j))
+                for j, n in enumerate(split(spp[0]))
+            )
+            / spp[0]
+        )
         adjoint = mi.TensorXf((2.0 * (image - TARGET) / image.size).astype(np.float32))
         gradient = {key: 0.0 for key in keys}
         for j, n in enumerate(split(spp[1])):

@@ -139,7 +139,9 @@ class DifferentiableRenderer:
         weights = np.asarray(adjoint, dtype=np.float64)
         width, height = self.size
         if weights.shape != (height, width, 3) or not np.all(np.isfinite(weights)):
-            raise UsdfabError(f"expected finite numbers of shape {(height, width, 3)}, got {weights.shape}", place="adjoint")
+            raise UsdfabError(
+                f"expected finite numbers of shape {(height, width, 3)}, got {weights.shape}", place="adjoint"
+            )
         weights = (self._gain / spp * weights).reshape(-1, 3)
         # Of order 1 in float32, whatever a mean over the picture did to it.
         unit = float(np.abs(weights).max()) or 1.0

@@ -171,9 +171,7 @@ def trace(
         inverse = dr.rcp(dr.maximum(go_on, 1e-30))
 
         if dr.hint(recording, mode="scalar"):
-            memory.write(
-                tuple(Vertex(color, si.wi, to_light, light, to_next, beta, inverse)), count, active
-            )
+            memory.write(tuple(Vertex(color, si.wi, to_light, light, to_next, beta, inverse)), count, active)
             if dr.hint(not stage.alone, mode="scalar"):
                 glow.write(mi.Color3f(0.0), count, active)
         else:
@@ -201,9 +199,7 @@ def empty_memory(stage: Stage) -> tuple[Any, Any]:
 
 
 @dr.syntax
-def walk_back(
-    stage: Stage, tables: Tables, adjoint: Any, count: Any, memory: Any, glow: Any
-) -> tuple[list[Any], Any]:
+def walk_back(stage: Stage, tables: Tables, adjoint: Any, count: Any, memory: Any, glow: Any) -> tuple[list[Any], Any]:
     """Derivatives of J along traced paths, where dJ/dL_0 is ``adjoint``.
 
     Returns
