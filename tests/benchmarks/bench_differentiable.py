@@ -64,11 +64,11 @@ def theirs(cloth, scene, camera, side: int, spp: tuple[int, int], variant: str):
     mi = load(variant)
     import drjit as dr
 
+    from usdfab.mi.camera import sensor
     from usdfab.mi.fiber_stage import seen_fibers
     from usdfab.mi.fibers import MAX_POINTS, curve_shapes, hair_bsdf
-    from usdfab.mi.scene import FIBER_UNITS
-    from usdfab.mi.camera import sensor
     from usdfab.mi.lights import emitters
+    from usdfab.mi.scene import FIBER_UNITS
     from usdfab.mi.space import Space
 
     curves = seen_fibers(scene, camera, MARGIN, MAX_POINTS)
@@ -103,7 +103,7 @@ def theirs(cloth, scene, camera, side: int, spp: tuple[int, int], variant: str):
             / spp[0]
         )
         adjoint = mi.TensorXf((2.0 * (image - TARGET) / image.size).astype(np.float32))
-        gradient = {key: 0.0 for key in keys}
+        gradient = dict.fromkeys(keys, 0.0)
         for j, n in enumerate(split(spp[1])):
             for key in keys:
                 params[key] = type(start[key])(dr.detach(params[key]))

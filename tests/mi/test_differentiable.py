@@ -208,7 +208,7 @@ def test_stripes():
     """Yarns of nearly the same colours: the derivatives of their colours add up to that of one."""
     color = np.array(fabric().warp.albedo)
     cloth = fabric(fibers=8)
-    stripes = tuple(tuple((color * (1.0 - 1e-6 * k)).tolist()) for k in range(3))
+    stripes = tuple(tuple((color * (1.0 - 1e-9 * k)).tolist()) for k in range(3))
     striped = make(replace(cloth, warp=replace(cloth.warp, yarn_albedo=stripes)))
     assert striped.optics.names()[3] == "warp.albedo[1].r"
     # The same curves with one color for each system.

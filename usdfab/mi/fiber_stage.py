@@ -1,4 +1,4 @@
-"""A swatch under its rig as a stage for paths through fibers: all curves are one shape, colours are rows of `Optics`."""
+"""A swatch under its rig as a stage for paths through fibers: one shape of all curves, colours are rows of `Optics`."""
 
 from __future__ import annotations
 
