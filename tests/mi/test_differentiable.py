@@ -89,7 +89,7 @@ def test_gradient_is_that_of_differences(renderer):
 
 @pytest.mark.slow
 def test_gradient_of_each_parameter_is_that_of_differences(renderer):
-    compare(renderer, directions(renderer.optics.names()), spp=8192, runs=12, bar=0.06)
+    compare(renderer, directions(renderer.optics.names()), spp=1024, runs=8, bar=0.25)
 
 
 @pytest.mark.slow
@@ -97,7 +97,7 @@ def test_gradients_under_lamps_with_a_surface_are_those_of_differences():
     """Light that paths run into, with its weight, is part of the gradient."""
     lamp = SphereLight("/Lamp", np.array([0.002, 0.0, 0.003]), 0.0015, np.full(3, 2.0))
     lit = make(lights=(dome(0.5), lamp))
-    compare(lit, {"all": np.linspace(0.6, 1.4, lit.optics.size)}, spp=2048, runs=16, bar=0.05)
+    compare(lit, {"all": np.linspace(0.6, 1.4, lit.optics.size)}, spp=512, runs=12, bar=0.05)
 
 
 def test_gradients_of_few_samples_are_right_on_average(renderer):
