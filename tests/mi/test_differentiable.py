@@ -26,7 +26,7 @@ from usdfab.mi import differentiable
 from usdfab.mi.differentiable import DifferentiableRenderer
 from usdfab.mi.fiber_tables import OpticsTables
 from usdfab.mi.render import MitsubaSettings, render
-from usdfab.usd.scene import Material, SphereLight
+from usdfab.usd.scene import Material, SphereLight, Texture
 
 SIDE = 8
 TARGET = np.linspace(-0.2, 0.3, SIDE * SIDE * 3).reshape(SIDE, SIDE, 3)
@@ -251,11 +251,13 @@ def test_wrong_calls(renderer):
         renderer.gradient(renderer.optics, TARGET[1:], 1, 0)
     with pytest.raises(UsdfabError, match="finite"):
         renderer.gradient(renderer.optics, np.full_like(TARGET, np.inf), 1, 0)
+    with pytest.raises(UsdfabError, match="colours are not those"):
+        renderer.render(replace(renderer.optics, system=np.array([0, 0])), 1, 0)
     with pytest.raises(UsdfabError, match="0 samples"):
         renderer.render(renderer.optics, 0, 0)
 
 
-def test_wrong_scenes(monkeypatch):
+def test_wrong_scenes():
     scene, camera = swatch(fabric(fibers=8), zoom=0.12)
 
     def fails(said: str, scene=scene, camera=camera, size=(8, 8), **more) -> None:
@@ -264,7 +266,15 @@ def test_wrong_scenes(monkeypatch):
 
     fails("scalar", device="scalar")
     fails("no 'gpu'", device="gpu")
-    fails("depth 1 at least 2|depth 1 must|at least 2", max_depth=1)
+    fails("depth 1 between", max_depth=1)
+    fails("a pixel or more", size=(0, 8))
+    mapped = replace(
+        scene.fabrics[0],
+        albedo_map=Texture("map.png", "rgb", ("repeat", "repeat"), False, np.ones(4), np.zeros(4), np.eye(2, 3)),
+    )
+    fails("albedo map", replace(scene, fabrics=(mapped,)))
+    tilted = replace(fabric(fibers=8), warp=replace(fabric(fibers=8).warp, cuticle_tilt=0.1))
+    fails("cuticle tilt", swatch(tilted)[0])
     fails("one fabric, got 0", replace(scene, fabrics=()))
     away = np.diag([1.0, -1.0, -1.0, 1.0])
     away[2, 3] = 1.0

@@ -49,13 +49,13 @@ def torch_image(
     UsdfabError
         As ``renderer.render``.
     """
-    image: torch.Tensor = _Image.apply(optics, renderer, spp, gradient_spp, seed)  # type: ignore[no-untyped-call]
+    image: torch.Tensor = _Image.apply(optics, renderer, spp, gradient_spp, seed)
     return image
 
 
 class _Image(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, optics: torch.Tensor, renderer: Differentiable, spp: int, gradient_spp: int, seed: int
     ) -> torch.Tensor:
         ctx.save_for_backward(optics)
@@ -65,7 +65,7 @@ class _Image(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, adjoint: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, adjoint: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         (optics,) = ctx.saved_tensors
         vector = optics.detach().cpu().double().numpy()
         found = ctx.renderer.gradient(vector, adjoint.detach().cpu().double().numpy(), ctx.spp, ctx.seed)
