@@ -57,12 +57,13 @@ def compare(renderer, ways: dict[str, np.ndarray], spp: int, runs: int, bar: flo
     error for the test to tell anything, relative to the derivative or to 0.02.
     """
     vector = renderer.optics.vector()
-    step = 0.04
     count = TARGET.size
     by_difference: dict[str, list] = {name: [] for name in ways}
     gradients = []
     for run in range(runs):
         for name, way in ways.items():
+            # Pictures are nearly linear in roughness; in dark colours they are not.
+            step = 0.08 if "roughness" in name else 0.04
             # The same seeds on both sides: much of the noise is common.
             seeds = 2 * run, 2 * run + 1
             more, less = ([renderer.render(vector + s * way, spp, seed) for seed in seeds] for s in (step, -step))
@@ -84,12 +85,13 @@ def compare(renderer, ways: dict[str, np.ndarray], spp: int, runs: int, bar: flo
 
 def test_gradient_is_that_of_differences(renderer):
     """Along one way that changes every parameter."""
-    compare(renderer, {"all": np.linspace(0.6, 1.4, renderer.optics.size)}, spp=512, runs=8, bar=0.05)
+    compare(renderer, {"all": np.linspace(0.6, 1.4, renderer.optics.size)}, spp=256, runs=8, bar=0.08)
 
 
 @pytest.mark.slow
-def test_gradient_of_each_parameter_is_that_of_differences(renderer):
-    compare(renderer, directions(renderer.optics.names()), spp=1024, runs=8, bar=0.25)
+@pytest.mark.parametrize("name", directions(optics_of(fabric()).names()))
+def test_gradient_of_each_parameter_is_that_of_differences(renderer, name):
+    compare(renderer, {name: directions(renderer.optics.names())[name]}, spp=512, runs=8, bar=0.3)
 
 
 @pytest.mark.slow
@@ -97,7 +99,7 @@ def test_gradients_under_lamps_with_a_surface_are_those_of_differences():
     """Light that paths run into, with its weight, is part of the gradient."""
     lamp = SphereLight("/Lamp", np.array([0.002, 0.0, 0.003]), 0.0015, np.full(3, 2.0))
     lit = make(lights=(dome(0.5), lamp))
-    compare(lit, {"all": np.linspace(0.6, 1.4, lit.optics.size)}, spp=512, runs=12, bar=0.05)
+    compare(lit, {"all": np.linspace(0.6, 1.4, lit.optics.size)}, spp=512, runs=8, bar=0.08)
 
 
 def test_gradients_of_few_samples_are_right_on_average(renderer):
@@ -157,11 +159,11 @@ def test_picture_is_that_of_the_backend():
     cloth = replace(fabric(fibers=6), size=(1.5e-3, 1.5e-3))
     scene, camera = swatch(cloth, dome(0.5), zoom=0.3)
     ours = DifferentiableRenderer(scene, camera, (SIDE, SIDE), device="llvm", max_depth=16)
-    settings = MitsubaSettings((SIDE, SIDE), (0, 0, SIDE, SIDE), spp=256, max_depth=16, device="llvm")
+    settings = MitsubaSettings((SIDE, SIDE), (0, 0, SIDE, SIDE), spp=96, max_depth=16, device="llvm")
     theirs = [render(scene, camera, replace(settings, seed=k)).pixels.mean() for k in range(4)]
-    means = [ours.render(ours.optics, 256, k).mean() for k in range(4)]
+    means = [ours.render(ours.optics, 96, k).mean() for k in range(4)]
     error = np.hypot(np.std(means, ddof=1), np.std(theirs, ddof=1)) / 2.0
-    assert error < 0.01 * np.mean(theirs)
+    assert error < 0.015 * np.mean(theirs)
     assert np.mean(means) == pytest.approx(np.mean(theirs), abs=4.0 * error)
 
 
