@@ -91,7 +91,7 @@ def test_gradient_is_that_of_differences(renderer):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", directions(optics_of(fabric()).names()))
 def test_gradient_of_each_parameter_is_that_of_differences(renderer, name):
-    compare(renderer, {name: directions(renderer.optics.names())[name]}, spp=512, runs=8, bar=0.3)
+    compare(renderer, {name: directions(renderer.optics.names())[name]}, spp=1024, runs=8, bar=0.3)
 
 
 @pytest.mark.slow
