@@ -128,6 +128,7 @@ def make_cloth(
     textures: TextureReader | None,
     budget: int = MAX_POINTS,
     window: Window = (-1.0, -1.0, 1.0, 1.0),
+    margin: float | None = None,
 ) -> Cloth:
     """The fibers of all fabrics of a scene.
 
@@ -139,6 +140,9 @@ def make_cloth(
         Reads albedo maps; without it they are left out, with a warning.
     budget:
         Most control points.
+    margin:
+        Cells of the weave to make around what the camera sees, and no more. None: all cloth where it fits the budget,
+        else ``MARGIN_CELLS``.
 
     Raises
     ------
@@ -154,8 +158,9 @@ def make_cloth(
     tiles = {surface.fabric: _tile(surface.fabric) for _, surface, _ in pieces}
     regions: list[list[Box] | None] = [None] * len(pieces)
     warnings: list[str] = []
-    if _needed(pieces, tiles, regions) > budget:
-        regions = [visible_boxes(place, camera, surface.fabric, window) for _, surface, place in pieces]
+    if margin is not None or _needed(pieces, tiles, regions) > budget:
+        cells = MARGIN_CELLS if margin is None else margin
+        regions = [visible_boxes(place, camera, surface.fabric, window, cells) for _, surface, place in pieces]
         needed = _needed(pieces, tiles, regions)
         if needed > budget:
             raise UsdfabError(
@@ -164,7 +169,7 @@ def make_cloth(
                 remedy="use --backend embree, which needs no copies, or show less with --region or a closer camera",
             )
         warnings.append(
-            f"only the cloth in view and {MARGIN_CELLS} yarns around it are fibers; the rest is an opaque surface, "
+            f"only the cloth in view and {cells:g} yarns around it are fibers; the rest is an opaque surface, "
             "so that light from there and through it is only about right"
         )
     found: list[Fibers] = []

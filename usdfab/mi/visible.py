@@ -27,8 +27,10 @@ _RAYS = 48
 """Rays on each side of the picture."""
 
 
-def visible_boxes(place: ClothSurface, camera: Camera, fabric: FabricParameters, window: Window) -> list[Box]:
-    """Boxes of cloth (x0, y0, x1, y1), metres, that do not overlap and hold all that is in view, with a margin.
+def visible_boxes(
+    place: ClothSurface, camera: Camera, fabric: FabricParameters, window: Window, margin: float = MARGIN_CELLS
+) -> list[Box]:
+    """Boxes of cloth (x0, y0, x1, y1), metres, that do not overlap and hold all that is in view and ``margin`` cells.
 
     Cloth behind other cloth counts as seen: light comes through.
     """
@@ -41,7 +43,7 @@ def visible_boxes(place: ClothSurface, camera: Camera, fabric: FabricParameters,
         x, y = np.meshgrid(camera.tan_half[0] * s, camera.tan_half[1] * t)
         directions = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.0)], axis=1) @ camera.to_world[:3, :3].T
         xy = np.concatenate([_met(place, near, camera.to_world[:3, 3], d) for d in directions])
-    return boxes_around(xy, MARGIN_CELLS * max(fabric.cell))
+    return boxes_around(xy, margin * max(fabric.cell))
 
 
 def boxes_around(places: Floats, margin: float) -> list[Box]:
