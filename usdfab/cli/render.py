@@ -68,10 +68,14 @@ def run(
         str | None, Parameter(help="Dask scheduler tcp://HOST:PORT whose workers render, or local for processes here.")
     ] = None,
     backend: Annotated[
-        str, Parameter(help="embree, or mitsuba: the same fibers in Mitsuba 3, for close-ups and small cloth.")
+        str, Parameter(help="embree, or mitsuba: the same fibers in Mitsuba 3, on a processor or a GPU.")
     ] = "embree",
     device: Annotated[
         str | None, Parameter(help="With --backend mitsuba: auto (the default), llvm, cuda or scalar.")
+    ] = None,
+    fibers: Annotated[
+        str | None,
+        Parameter(help="With --backend mitsuba: tiled, or flattened: every fiber a curve of its own, for close-ups."),
     ] = None,
     strict: Annotated[
         bool, Parameter(negative="", help="Stop at whatever is wrong with the stage instead of leaving it out.")
@@ -115,8 +119,8 @@ def run(
             raise UsdfabError("the Mitsuba backend has no such option", place=wrong, remedy="use --backend embree")
     elif backend != "embree":
         raise UsdfabError(f"there is no '{backend}'", place="--backend", remedy="choose embree or mitsuba")
-    elif device is not None:
-        raise UsdfabError("is for --backend mitsuba", place="--device")
+    elif device is not None or fibers is not None:
+        raise UsdfabError("is for --backend mitsuba", place="--device" if device is not None else "--fibers")
     target = output or Path(stage.stem + ".png")
     options = picture_options(target, aov, denoise, exposure, view, overwrite)
     part = parse_tile(tile)
@@ -148,7 +152,7 @@ def run(
         from usdfab.cli.render_mitsuba import render_mitsuba
 
         frame = FrameOptions(settings, window, options, resume, f"rendering {target.name}", quiet, json)
-        facts, warnings, worn = render_mitsuba(source(files[0]), files[0], frame, device or "auto", threads)
+        facts, warnings, worn = render_mitsuba(source(files[0]), files[0], frame, device or "auto", threads, fibers or "auto")
         if json:
             print_json(facts | {"outputs": [target], "fabric": worn, "warnings": warnings})
         return
