@@ -271,7 +271,13 @@ def integrator_class() -> type:
                 path.L += path.beta * self._emission(scene, path, si, other)
                 surface = other & hit.valid
                 path.active &= ~(other & ~hit.valid)
-                if not self.bare:
+                if self.bare:
+                    # The interpolated normal may look away: the triangle's own does not.
+                    side = -dr.sign(dr.dot(si.n, path.d))
+                    away = surface & (side * si.wi.z <= 1e-4)
+                    si.sh_frame = dr.select(away, mi.Frame3f(si.n), si.sh_frame)
+                    si.wi = dr.select(away, si.to_local(-path.d), si.wi)
+                else:
                     path.active &= ~surface
                     surface = mi.Bool(False)
                 ok, slab, entry = self.cloth.enter(self.fibers, found.prim_index, found.prim_uv, path.d, hit.t, cloth)
@@ -329,6 +335,9 @@ def integrator_class() -> type:
                     d = dr.select(fiber, d, si.to_world(drawn.wo))
                     weight, new_pdf = dr.select(fiber, weight, own_weight), dr.select(fiber, new_pdf, drawn.pdf)
                     null = surface & mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Null)
+                    # No light through the triangle where only the interpolated normal sees it.
+                    value &= fiber | (side * dr.dot(si.n, light.d) > 0.0)
+                    weight &= fiber | null | (side * dr.dot(si.n, d) > 0.0)
                 share = dr.select(light.delta, 1.0, light.pdf / (light.pdf + pdf))
                 arriving = dr.select(lit, path.beta * value * radiance * share, 0.0)
                 lit &= dr.max(arriving) > 0.0
