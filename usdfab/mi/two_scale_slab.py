@@ -119,7 +119,9 @@ class FiberScene:
         if not self.varied:
             return first
         key = mi.UInt64(mi.UInt32(ix)) | (mi.UInt64(mi.UInt32(iy)) << 32)
-        return first + mi.UInt32(mix(mix(key)) % self.variants(fabric, active))
+        # Masked lanes look up a 0, by which the processor would divide all the same.
+        count = dr.maximum(self.variants(fabric, active), mi.UInt64(1))
+        return first + mi.UInt32(mix(mix(key)) % count)
 
     def offset(self, tile: Any, active: Any) -> Any:
         """Where a tile's lower left corner is among all tiles."""
