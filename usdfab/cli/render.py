@@ -97,7 +97,7 @@ def run(
         usdfab render fabric.usda -o swatch.png --resolution 720 --spp 256
         usdfab render samples/drape.usda --fabric fabric.usda -o drape.exr --resolution 1280x960 --noise 0.05
         usdfab render walk.usda -o walk.####.exr --frames 1-48 --aov depth,normal --scheduler tcp://farm:8786
-        usdfab render fabric.usda -o check.exr --backend mitsuba --resolution 256
+        usdfab render cloth.usda -o check.exr --backend mitsuba --resolution 256 --device llvm
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def run(
 
     if backend == "mitsuba":
         refused = {
-            "--time": time, "--noise": noise, "--frames": frames, "--aov": aov, "--denoise": denoise, "--tile": tile,
+            "--time": time, "--noise": noise, "--aov": aov, "--denoise": denoise, "--tile": tile,
             "--checkpoint": checkpoint, "--resume": resume, "--workers": workers, "--scheduler": scheduler,
         }  # fmt: skip
         wrong = next((option for option, value in refused.items() if value is not None and value is not False), None)
@@ -150,12 +150,6 @@ def run(
 
     if backend == "mitsuba":
         from usdfab.cli.render_mitsuba import render_mitsuba
-
-        frame = FrameOptions(settings, window, options, resume, f"rendering {target.name}", quiet, json)
-        facts, warnings, worn = render_mitsuba(source(files[0]), files[0], frame, device or "auto", threads, fibers or "auto")
-        if json:
-            print_json(facts | {"outputs": [target], "fabric": worn, "warnings": warnings})
-        return
     results, warnings, worn = [], [], None
     place = "local" if scheduler is None and workers is not None else scheduler
     idle = place is None or all(file.finished for file in files)
@@ -163,7 +157,12 @@ def run(
         for k, file in enumerate(files):
             label = f"rendering {file.output.name}" + (f" ({k + 1} of {len(files)})" if len(files) > 1 else "")
             frame = FrameOptions(settings, window, options, resume, label, quiet, json)
-            facts, said, worn_here = render_frame(source(file), file, frame, remote)
+            if backend == "mitsuba":
+                facts, said, worn_here = render_mitsuba(
+                    source(file), file, frame, device or "auto", threads, fibers or "auto"
+                )
+            else:
+                facts, said, worn_here = render_frame(source(file), file, frame, remote)
             results.append(facts)
             warnings += [warning for warning in said if warning not in warnings]
             worn = worn_here or worn

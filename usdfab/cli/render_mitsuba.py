@@ -93,6 +93,7 @@ def _facts(file: RenderFile, done: MitsubaRender) -> Facts:
 
 def _line(file: RenderFile, done: MitsubaRender) -> str:
     height, width = done.pixels.shape[:2]
-    points = f", {done.points} control points" if done.points else ""
+    kind = "tiles of" if done.tiled else "fibers of"
+    points = f", {kind} {done.points} control points" if done.points else ""
     what = f"{width} x {height}, {done.spp} spp, {done.seconds:.1f} s"
     return f"wrote {file.output}: {what}, Mitsuba ({done.device}){points}"

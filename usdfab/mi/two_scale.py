@@ -15,6 +15,7 @@ adds direct light.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +27,9 @@ from usdfab.mi.two_scale_fiber import FiberOptics, fiber_vertex
 from usdfab.mi.two_scale_slab import FiberScene, Slab, nowhere
 
 RUSSIAN_ROULETTE_DEPTH = 5
+SHADOW_ROULETTE = 4.0 * math.pi
+"""From the second vertex on, light that would arrive with less than what isotropic scattering gives gets its shadow
+ray by chance only, as in the tracer."""
 
 MAX_SURFACES = 64
 """Layers of fabric or of transparent surface that a ray may pass between two vertices."""
@@ -339,7 +343,11 @@ def integrator_class() -> type:
                     value &= fiber | (side * dr.dot(si.n, light.d) > 0.0)
                     weight &= fiber | null | (side * dr.dot(si.n, d) > 0.0)
                 share = dr.select(light.delta, 1.0, light.pdf / (light.pdf + pdf))
-                arriving = dr.select(lit, path.beta * value * radiance * share, 0.0)
+                value = path.beta * value * share
+                # Most vertices send next to nothing towards a lamp: these get their shadow ray by chance only.
+                likely = dr.select(path.depth > 1, dr.minimum(dr.max(value) * SHADOW_ROULETTE, 1.0), 1.0)
+                lit &= sampler.next_1d(vertex) < likely
+                arriving = dr.select(lit, value * radiance / likely, 0.0)
                 lit &= dr.max(arriving) > 0.0
                 reach = light.dist * SHADOW_SHARE
                 shadow = Shadow(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +83,7 @@ def load_two_scale(
     for surface in scene.fabrics:
         if surface.fabric not in fabrics:
             fabrics.append(surface.fabric)
-    tiles = build_tiles(fabrics)
+    tiles = _tiles(tuple(fabrics))
     numbers = [fabrics.index(surface.fabric) for surface in scene.fabrics]
     maps, said = _albedo_maps(mi, scene, cloth, textures)
     warnings += said
@@ -92,6 +93,12 @@ def load_two_scale(
         masked=any(s["bsdf"]["type"] == "mask" for s in meshes.values()),
     )  # fmt: skip
     return TwoScaleScene(loaded, integrator, tuple(dict.fromkeys(warnings)), len(tiles.points))
+
+
+@functools.lru_cache(maxsize=1)
+def _tiles(fabrics: tuple[FabricParameters, ...]) -> FiberTiles:
+    """The frames of an animation have the same."""
+    return build_tiles(fabrics)
 
 
 def _integrator(
