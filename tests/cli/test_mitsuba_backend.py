@@ -8,7 +8,6 @@ import sys
 
 import numpy as np
 import pytest
-
 from pxr import Usd, UsdGeom, UsdLux
 
 from usdfab.imaging import read_image, write_image

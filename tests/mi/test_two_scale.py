@@ -5,6 +5,7 @@ Pictures are compared pixel by pixel with the noise of both taken into account: 
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 from dataclasses import replace
@@ -184,17 +185,24 @@ def test_the_same_variant_stands_everywhere(slab):
     np.testing.assert_array_equal(np.array(slab.mix(slab.mix(key)) % 5), tile_variants(i, j, 5))
 
 
+def halfway(control, starts):
+    """The middles of segments of cubic B-splines."""
+    a, b, c, d = (control[starts + k] for k in range(4))
+    return (a + 23.0 * (b + c) + d) / 48.0
+
+
 def test_a_tile_holds_all_that_overlaps_its_cell():
     """Points of the infinite cloth's curves that lie in the cell lie on the tile's segments, each on one."""
     patch = patch_variants(scenes.fabric(fibers=3))[0]
     for system in patch.curves:
         control, segments, curve = tile_segments(system, patch.size)
         assert segments.max() + 3 < len(control) and curve.max() < system.curves
-        middle = (control[segments] + 23.0 * (control[segments + 1] + control[segments + 2]) + control[segments + 3]) / 48.0
+        middle = (
+            control[segments] + 23.0 * (control[segments + 1] + control[segments + 2]) + control[segments + 3]
+        ) / 48.0
         inside = np.all((middle[:, :2] >= 0.0) & (middle[:, :2] < patch.size), axis=1)
         points, offsets = system.extended(1, 2)
-        starts = np.concatenate([np.arange(a, b - 3) for a, b in zip(offsets[:-1], offsets[1:], strict=True)])
-        every = (points[starts] + 23.0 * (points[starts + 1] + points[starts + 2]) + points[starts + 3]) / 48.0
+        every = halfway(points, np.concatenate([np.arange(a, b - 3) for a, b in itertools.pairwise(offsets)]))
         wrapped = np.c_[np.mod(every[:, :2], patch.size), every[:, 2]]
         order = [a[np.lexsort(np.round(a, 10).T)] for a in (middle[inside], wrapped)]
         np.testing.assert_allclose(*order, atol=1e-9)
@@ -225,7 +233,8 @@ def test_memory_does_not_grow_with_the_cloth():
 def test_flattened_and_tiled_are_the_same_picture():
     scene, view = swatch()
     settings = [
-        MitsubaSettings((12, 12), (0, 0, 12, 12), 512, 3, device="llvm", fibers=fibers) for fibers in ("tiled", "flattened")
+        MitsubaSettings((12, 12), (0, 0, 12, 12), 512, 3, device="llvm", fibers=fibers)
+        for fibers in ("tiled", "flattened")
     ]
     tiled, flattened = (render(scene, view, s) for s in settings)
     assert tiled.tiled and not flattened.tiled and flattened.points > tiled.points

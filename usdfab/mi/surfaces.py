@@ -1,10 +1,10 @@
 """Meshes without fabrics: PLY files, and UsdPreviewSurface: our own plugin, or in ``scalar`` Mitsuba's ``principled``.
 
 What differs from the tracer. Normal maps are left out. Textures are resampled to ``TEXELS`` on a side over what the
-mesh uses of them. In the scalar variant, where no plugin of ours runs: ``principled`` has Disney's diffuse lobe, which is darker or brighter towards grazing
-angles by its roughness, and its own energy balance between the lobes; its coat is weighted by a quarter and has another
-roughness scale; specularColor is not known to it. So pictures agree to a few percent there, while a surface without
-specular (an index of refraction below 1.07) is exactly Lambert in both.
+mesh uses of them. In the scalar variant, where no plugin of ours runs: ``principled`` has Disney's diffuse lobe, which
+is darker or brighter towards grazing angles by its roughness, and its own energy balance between the lobes; its coat is
+weighted by a quarter and has another roughness scale; specularColor is not known to it. So pictures agree to a few
+percent there, while a surface without specular (an index of refraction below 1.07) is exactly Lambert in both.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The fibers' scattering in the two-scale integrator: the optics of a hit from tables, its frame, values and samples."""
+"""Fibers in the two-scale integrator: the optics of a hit from tables, its frame, values and samples."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ class FiberOptics:
 
     def material(self, row: Any, tint: Any | None, active: Any) -> PackedFiber:
         """The material of a row, its albedo coefficient multiplied by ``tint`` (at most 1)."""
-        fields = [
+        fields: list[Any] = [
             tuple(pick(row, active) for pick in field) if isinstance(field, tuple) else field(row, active)
             for field in self._fields
         ]
-        tilt = self._tilt if isinstance(self._tilt, float) else self._tilt(row, active)
-        packed = PackedFiber(*fields, tilt)
+        fields.append(self._tilt if isinstance(self._tilt, float) else self._tilt(row, active))
+        packed = PackedFiber._make(fields)
         if tint is None:
             return packed
         albedo = self._albedo(row, active) * dr.maximum(tint, 1e-4)

@@ -87,11 +87,11 @@ def load_two_scale(
     numbers = [fabrics.index(surface.fabric) for surface in scene.fabrics]
     maps, said = _albedo_maps(mi, scene, cloth, textures)
     warnings += said
-    integrator = _integrator(
-        mi, scene, cloth, tiles, numbers, maps, shape, space, folder,
-        reach=reach, max_depth=max_depth, bare=bool(meshes),
-        masked=any(s["bsdf"]["type"] == "mask" for s in meshes.values()),
-    )  # fmt: skip
+    masked = any(s["bsdf"]["type"] == "mask" for s in meshes.values())
+    macro, optics = _device_scene(mi, scene, cloth, tiles, numbers, maps, shape, space, reach, masked, folder)
+    from usdfab.mi.two_scale import integrator_class
+
+    integrator = integrator_class()(macro, optics, max_depth=max_depth, bare=bool(meshes))
     return TwoScaleScene(loaded, integrator, tuple(dict.fromkeys(warnings)), len(tiles.points))
 
 
@@ -101,20 +101,21 @@ def _tiles(fabrics: tuple[FabricParameters, ...]) -> FiberTiles:
     return build_tiles(fabrics)
 
 
-def _integrator(
+def _device_scene(
     mi: Any, scene: Scene, cloth: ClothTriangles, tiles: FiberTiles, numbers: list[int], maps: list, shape: Any,
-    space: Space, folder: Path, **options: Any,
-) -> Any:  # fmt: skip
+    space: Space, reach: float, masked: bool, folder: Path,
+) -> tuple[Any, Any]:  # fmt: skip
+    """(macro tracer, optics of all fibers): arrays on the device."""
     # These modules need a variant that is set.
-    from usdfab.mi.two_scale import integrator_class
     from usdfab.mi.two_scale_enter import ClothTables
     from usdfab.mi.two_scale_fiber import FiberOptics
+    from usdfab.mi.two_scale_macro import MacroTracer
     from usdfab.mi.two_scale_slab import FiberScene
 
     own = [tiles.fabrics[k] for k in numbers]
     fibers = FiberScene(tiles, numbers, _curves(mi, tiles, folder))
     tables = ClothTables(cloth, space.scale, own, [s.meters_per_uv for s in scene.fabrics], maps)
-    return integrator_class()(fibers, FiberOptics(tiles.materials), tables, shape, **options)
+    return MacroTracer(fibers, tables, shape, reach=reach, masked=masked), FiberOptics(tiles.materials)
 
 
 def _curves(mi: Any, tiles: FiberTiles, folder: Path) -> Any:

@@ -75,8 +75,8 @@ class Slab:
 
 def nowhere() -> Slab:
     """A slab that no ray is in."""
-    zero = [mi.Vector3f(0.0) for _ in range(3)]
-    return Slab(mi.Point3f(0.0), mi.Int32(0), mi.Int32(0), *zero, mi.Float(1.0), mi.UInt32(0))
+    m0, m1, m2 = (mi.Vector3f(0.0) for _ in range(3))
+    return Slab(mi.Point3f(0.0), mi.Int32(0), mi.Int32(0), m0, m1, m2, mi.Float(1.0), mi.UInt32(0))
 
 
 def mix(x: Any) -> Any:
@@ -138,7 +138,7 @@ class FiberScene:
         steep = dr.maximum(dr.abs(dr.dot(slab.m2, direction)), 1e-9 * slab.up)
         return dr.minimum(dr.maximum(high, -low) / steep, 4.0 * thickness), thickness
 
-    def _step(self, bounds: tuple[Any, Any, Any, Any], p: Any, d: Any) -> tuple[Any, Any, Any]:
+    def _step(self, bounds: tuple[Any, ...], p: Any, d: Any) -> tuple[Any, Any, Any]:
         """Distance to the border of the tile or slab, and whether it is one in x, or in y."""
         width, height, low, high = bounds
         # A direction along a border never gets to it: the quotient is infinite, and 0 / 0 where it lies in it.
@@ -153,7 +153,7 @@ class FiberScene:
         t = dr.select(in_y, dr.maximum(ty, 0.0), t)
         return t, in_x & ~in_y, in_y
 
-    def _wrap(self, bounds: tuple[Any, Any, Any, Any], p: Any, d: Any, in_x: Any, in_y: Any) -> tuple[Any, Any, Any]:
+    def _wrap(self, bounds: tuple[Any, ...], p: Any, d: Any, in_x: Any, in_y: Any) -> tuple[Any, Any, Any]:
         """(place in the next tile, steps of the tile's coordinates) behind a border."""
         width, height, _, _ = bounds
         step_x, step_y = mi.Int32(dr.select(d.x > 0.0, 1, -1)), mi.Int32(dr.select(d.y > 0.0, 1, -1))
@@ -161,8 +161,8 @@ class FiberScene:
         y = dr.select(in_y, dr.select(d.y > 0.0, 0.0, height), p.y)
         return mi.Point3f(x, y, p.z), dr.select(in_x, step_x, 0), dr.select(in_y, step_y, 0)
 
-    def _bounds(self, fabric: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-        return tuple(c(fabric, active) for c in (self.width, self.height, self.low, self.high))  # type: ignore
+    def _bounds(self, fabric: Any, active: Any) -> tuple[Any, ...]:
+        return tuple(c(fabric, active) for c in (self.width, self.height, self.low, self.high))
 
     def trace(self, slab: Slab, d: Any, active: Any) -> tuple[Any, Any, Slab, Any, Any, Any]:
         """Nearest fiber along a ray.
