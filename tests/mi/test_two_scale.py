@@ -26,10 +26,12 @@ from scipy.stats import poisson
 from usdfab.errors import UsdfabError
 from usdfab.fibers import patch_variants
 from usdfab.fibers.tiles import tile_variants
+from usdfab.imaging import write_image
 from usdfab.mi.render import MitsubaSettings, render
 from usdfab.mi.two_scale_tiles import build_tiles, tile_segments
 from usdfab.tracer import RenderSettings, Tracer
-from usdfab.usd.scene import PointLight, SphereLight
+from usdfab.tracer.texture_reader import TextureReader
+from usdfab.usd.scene import PointLight, SphereLight, Texture
 
 LAMP = PointLight("/Lamp", np.array([0.02, 0.01, 0.05]), np.full(3, 0.006))
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -83,7 +85,7 @@ def bound_drape(folder, preset="denim"):
 def pictures(scene, view, size, spp, depth=64):
     """(ours, theirs): (pixels, variance) of the tracer and of the two-scale integrator."""
     settings = MitsubaSettings(size, (0, 0, *size), spp, depth, device="llvm", fibers="tiled")
-    theirs = render(scene, view, settings)
+    theirs = render(scene, view, settings, textures=TextureReader())
     assert theirs.tiled and not theirs.warnings
     ours = Tracer(scene).render(view, RenderSettings(size, spp=2 * spp, max_depth=depth))
     return [(np.asarray(r.pixels, dtype=float), np.asarray(r.variance, dtype=float)) for r in (ours, theirs)]
@@ -156,6 +158,17 @@ def test_colours_of_the_mesh_and_copies_that_are_mirrored_and_larger():
     agree(*pictures(scene, scenes.look((0, 0, 0.04), (0, 0, 0), (0.15, 0.1)), (18, 12), 384), 0.015)
 
 
+def test_an_albedo_map(tmp_path):
+    """A picture that colours the fibers, looked up with coordinates of its own."""
+    colors = np.linspace(0.1, 1.0, 4 * 5 * 3).reshape(4, 5, 3).astype(np.float32)
+    file = write_image(tmp_path / "map.exr", colors, half=False)
+    turned = np.array([[0.0, 180.0, 0.1], [210.0, 0.0, 0.3]])
+    texture = Texture(str(file), "rgb", ("repeat", "mirror"), True, np.full(4, 0.9), np.full(4, 0.05), turned)
+    scene = scenes.scene([scenes.plane(8e-3)], [scenes.cloth_material()], [LAMP], [scenes.fabric(fibers=6)])
+    scene = replace(scene, fabrics=(replace(scene.fabrics[0], albedo_map=texture),))
+    agree(*pictures(scene, scenes.look((0, 0, 0.04), (0, 0, 0), (0.08, 0.08)), (12, 12), 512), 0.015)
+
+
 def test_a_transparent_surface_over_cloth():
     glass = replace(scenes.lambert((0.9, 0.5, 0.2)), opacity=0.4)
     sheet, cover = scenes.plane(8e-3), scenes.plane(4e-3, 1, 2e-3)
@@ -183,6 +196,25 @@ def test_the_same_variant_stands_everywhere(slab):
     i, j = (a.ravel() for a in np.meshgrid(np.r_[-3:4, 2**31 - 1, -(2**31)], np.r_[-70000, -2:3, 123456]))
     key = mi.UInt64(mi.UInt32(mi.Int32(i))) | (mi.UInt64(mi.UInt32(mi.Int32(j))) << 32)
     np.testing.assert_array_equal(np.array(slab.mix(slab.mix(key)) % 5), tile_variants(i, j, 5))
+
+
+def test_tilts_of_several_materials_in_one_program():
+    import mitsuba as mi
+
+    from usdfab.scattering.fiber_drjit import eval_fiber, pack_fiber, prepare_fiber
+
+    wo, (sin_ti, cos_ti, alpha) = (0.5, -0.3, math.sqrt(0.66)), (0.28, 0.96, mi.Float(0.7))
+
+    def value(tilt):
+        packed = pack_fiber(mi.Color3f(0.7, 0.4, 0.2), *(mi.Float(x) for x in (0.4, 0.3, 0.2, 1.55)), tilt)
+        prepared = prepare_fiber(packed, *(mi.Float(x) for x in wo))
+        color, pdf = eval_fiber(packed, prepared, mi.Float(sin_ti), mi.Float(cos_ti), alpha)
+        return np.r_[np.array(color), np.array(pdf)[None]]
+
+    tilts = (0.0, 0.05, -0.1)
+    together = value(mi.Float(tilts))
+    np.testing.assert_allclose(together, np.concatenate([value(t) for t in tilts], axis=1), rtol=1e-4)
+    assert np.ptp(together[3]) > 0.02 * together[3].mean()
 
 
 def halfway(control, starts):

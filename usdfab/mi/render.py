@@ -120,12 +120,12 @@ def render(
         import drjit
 
         drjit.set_thread_count(settings.threads)
-    start = time.perf_counter()
     tiled = tiled and wears_cloth(scene)
     loaded = _load(mi, scene, camera, settings, tiled, pictures, textures, fiber_bsdf)
     x0, y0, x1, y1 = settings.region
     counts = passes(settings.spp, (x1 - x0) * (y1 - y0))
     total, squares = np.zeros((y1 - y0, x1 - x0, 3)), np.zeros((y1 - y0, x1 - x0, 3))
+    start = time.perf_counter()
     for number, count in enumerate(counts):
         seed = int(np.random.SeedSequence([settings.seed, number]).generate_state(1)[0])
         image = mi.render(loaded.scene, integrator=loaded.integrator, spp=count, seed=seed)

@@ -131,7 +131,7 @@ def integrator_class() -> type:
         # --- The stages of the loop's body; they write into the path ---
 
         def _fly(self, scene: Any, path: Path) -> tuple[Any, Any, Any]:
-            """Macro scale: to a light, a surface, or into a fabric. Returns (place, whether it is a surface, its side)."""
+            """Macro scale: to a light, a surface, or into a fabric. Returns (place, is it a surface, its side)."""
             outside = path.active & ~path.inside
             hit, cloth, mesh = self.macro.trace(
                 scene, path.origin, path.d, mi.Float(INFINITE), path.skip_mesh, path.skip_distance, outside

@@ -69,7 +69,8 @@ class MacroTracer:
     def __init__(self, fibers: FiberScene, cloth: ClothTables, cloth_shape: Any, *, reach: float, masked: bool) -> None:
         self.fibers, self.cloth, self.masked = fibers, cloth, masked
         self.cloth_shape = mi.ShapePtr(cloth_shape)
-        self.tiny = 1e-6 * reach
+        # A number in memory: the frames of an animation share one program.
+        self.tiny = dr.opaque(mi.Float, 1e-6 * reach)
 
     def beyond(self, t: Any) -> Any:
         """A little farther than a hit at ``t``: where the search goes on behind it."""

@@ -171,8 +171,9 @@ def _albedo_map(mi: Any, texture: Texture, uv: NDArray, textures: TextureReader)
     values = textures(texture, np.stack([u.ravel(), v.ravel()], axis=1)).reshape(TEXELS, TEXELS, 3)
     stored = mi.Texture2f(mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32)))
 
+    corner, extent = mi.Point2f(*low.tolist()), mi.Vector2f(*size.tolist())
+
     def lookup(at: Any) -> Any:
-        at = (at - mi.Point2f(*low.tolist())) / mi.Vector2f(*size.tolist())
-        return mi.Color3f(stored.eval(mi.Point2f(at)))
+        return mi.Color3f(stored.eval(mi.Point2f((at - corner) / extent)))
 
     return lookup
