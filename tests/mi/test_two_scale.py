@@ -27,7 +27,7 @@ from usdfab.errors import UsdfabError
 from usdfab.fibers import patch_variants
 from usdfab.fibers.tiles import tile_variants
 from usdfab.imaging import write_image
-from usdfab.mi.render import MitsubaSettings, render
+from usdfab.mi.render import MitsubaSettings, _tiled, render
 from usdfab.mi.two_scale_tiles import build_tiles, tile_segments
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.tracer.texture_reader import TextureReader
@@ -288,6 +288,11 @@ def test_what_is_refused():
     settings = MitsubaSettings((4, 4), (0, 0, 4, 4), 1, device="scalar", fibers="tiled")
     with pytest.raises(UsdfabError, match=r"--fibers tiled: tiled fibers need Dr.Jit.* use --device llvm"):
         render(scene, view, settings)
+    assert not _tiled("auto", "cuda") and not _tiled("auto", "scalar") and _tiled("auto", "llvm")
+    with pytest.raises(
+        UsdfabError, match=r"--fibers tiled: .* two scenes .* OptiX; use --device llvm, or --fibers flat"
+    ):
+        _tiled("tiled", "cuda")
     with pytest.raises(UsdfabError, match="--fibers: there is no 'woven'; choose auto, tiled, flattened"):
         render(scene, view, replace(settings, fibers="woven"))
     with pytest.raises(UsdfabError, match="no light"):

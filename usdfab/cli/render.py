@@ -75,7 +75,7 @@ def run(
     ] = None,
     fibers: Annotated[
         str | None,
-        Parameter(help="With --backend mitsuba: tiled, or flattened: every fiber a curve of its own, for close-ups."),
+        Parameter(help="With --backend mitsuba: tiled (the default with llvm), or flattened: all fibers, close-ups."),
     ] = None,
     strict: Annotated[
         bool, Parameter(negative="", help="Stop at whatever is wrong with the stage instead of leaving it out.")

@@ -86,7 +86,7 @@ def _facts(file: RenderFile, done: MitsubaRender) -> Facts:
         "spp": done.spp,
         "noise": None if noise is None else round(noise, 6),
         "seconds": round(done.seconds, 3),
-        "fibers": "tiled" if done.tiled else "flattened",
+        "fibers": None if not done.points else "tiled" if done.tiled else "flattened",
         "control_points": done.points,
     }
 

@@ -32,7 +32,13 @@ FEWEST_PASSES = 4
 
 Fibers = Literal["auto", "tiled", "flattened"]
 """How cloth is made: one copy of each tile, which rays find again everywhere (any amount of cloth); or every fiber as a
-curve on the mesh, an independent check for close-ups. ``auto``: tiled where the variant has Dr.Jit, else flattened."""
+curve on the mesh, an independent check for close-ups. ``auto``: tiled on LLVM, else flattened."""
+
+_NOT_TILED = {
+    "scalar": "tiled fibers need Dr.Jit, which the scalar variant of Mitsuba has not",
+    # Mitsuba issue 1349: rays of a second scene with other kinds of shapes are left out of a kernel, with a warning.
+    "cuda": "tiled fibers need two scenes in one program, which Mitsuba does not support with OptiX",
+}
 
 
 @dataclass(frozen=True)
@@ -150,12 +156,10 @@ def _tiled(fibers: str, device: str) -> bool:
     """Whether cloth is made of tiles on a device."""
     if fibers not in get_args(Fibers):
         raise UsdfabError(f"there is no '{fibers}'", place="--fibers", remedy=f"choose {', '.join(get_args(Fibers))}")
-    if device == "scalar" and fibers == "tiled":
-        raise UsdfabError(
-            "tiled fibers need Dr.Jit, which the scalar variant of Mitsuba has not",
-            place="--fibers tiled", remedy="use --device llvm, or --fibers flattened",
-        )  # fmt: skip
-    return fibers != "flattened" and device != "scalar"
+    if fibers == "tiled" and device in _NOT_TILED:
+        remedy = "use --device llvm, or --fibers flattened"
+        raise UsdfabError(_NOT_TILED[device], place="--fibers tiled", remedy=remedy)
+    return fibers != "flattened" and device not in _NOT_TILED
 
 
 def _load(

@@ -60,6 +60,8 @@ def cloth_triangles(scene: Scene) -> ClothTriangles:
             scale = np.array([f.meters_per_uv for f in scene.fabrics] + [1.0])[fabric]
             own = _of_mesh(mesh, scale)
             for copy, matrix in enumerate(copies):
+                if matrix is not None and np.linalg.matrix_rank(matrix[:, :3]) < 3:
+                    continue  # scaled to nothing: no ray meets it
                 corners, normal, frames = own if matrix is None else _placed(*own, matrix)
                 tint = np.ones_like(corners) if mesh.albedo is None else np.asarray(mesh.albedo, dtype=float)
                 ids = np.full(len(fabric), number + copy)
