@@ -87,7 +87,7 @@ def test_smooth_fibers_of_two_roughnesses():
 
 
 def compare(scene, view, spp, tolerance, device):
-    settings = MitsubaSettings((SIDE, SIDE), (0, 0, SIDE, SIDE), spp, device=device)
+    settings = MitsubaSettings((SIDE, SIDE), (0, 0, SIDE, SIDE), spp, device=device, fibers="flattened")
     theirs = render(scene, view, settings)
     assert theirs.points > 10_000 and not theirs.warnings
     ours = Tracer(scene).render(view, RenderSettings((SIDE, SIDE), spp=2 * spp))
@@ -106,7 +106,10 @@ def compare(scene, view, spp, tolerance, device):
 def test_the_compiled_variant_gives_the_same():
     """All cores and wavefronts against one path after the other, in one process."""
     scene, view = swatch()
-    settings = [MitsubaSettings((16, 16), (0, 0, 16, 16), 128, device=device) for device in ("scalar", "llvm")]
+    settings = [
+        MitsubaSettings((16, 16), (0, 0, 16, 16), 128, device=device, fibers="flattened")
+        for device in ("scalar", "llvm")
+    ]
     scalar, compiled = (render(scene, view, s) for s in settings)
     assert (scalar.device, compiled.device) == ("scalar", "llvm")
     error = np.sqrt((scalar.variance + compiled.variance).sum(axis=(0, 1), dtype=float)) / 16**2

@@ -68,10 +68,14 @@ def run(
         str | None, Parameter(help="Dask scheduler tcp://HOST:PORT whose workers render, or local for processes here.")
     ] = None,
     backend: Annotated[
-        str, Parameter(help="embree, or mitsuba: the same fibers in Mitsuba 3, for close-ups and small cloth.")
+        str, Parameter(help="embree, or mitsuba: the same fibers in Mitsuba 3, on a processor or a GPU.")
     ] = "embree",
     device: Annotated[
         str | None, Parameter(help="With --backend mitsuba: auto (the default), llvm, cuda or scalar.")
+    ] = None,
+    fibers: Annotated[
+        str | None,
+        Parameter(help="With --backend mitsuba: tiled (the default with llvm), or flattened: all fibers, close-ups."),
     ] = None,
     strict: Annotated[
         bool, Parameter(negative="", help="Stop at whatever is wrong with the stage instead of leaving it out.")
@@ -93,7 +97,7 @@ def run(
         usdfab render fabric.usda -o swatch.png --resolution 720 --spp 256
         usdfab render samples/drape.usda --fabric fabric.usda -o drape.exr --resolution 1280x960 --noise 0.05
         usdfab render walk.usda -o walk.####.exr --frames 1-48 --aov depth,normal --scheduler tcp://farm:8786
-        usdfab render fabric.usda -o check.exr --backend mitsuba --resolution 256
+        usdfab render cloth.usda -o check.exr --backend mitsuba --resolution 256 --device llvm
 
     Parameters
     ----------
@@ -107,7 +111,7 @@ def run(
 
     if backend == "mitsuba":
         refused = {
-            "--time": time, "--noise": noise, "--frames": frames, "--aov": aov, "--denoise": denoise, "--tile": tile,
+            "--time": time, "--noise": noise, "--aov": aov, "--denoise": denoise, "--tile": tile,
             "--checkpoint": checkpoint, "--resume": resume, "--workers": workers, "--scheduler": scheduler,
         }  # fmt: skip
         wrong = next((option for option, value in refused.items() if value is not None and value is not False), None)
@@ -115,8 +119,8 @@ def run(
             raise UsdfabError("the Mitsuba backend has no such option", place=wrong, remedy="use --backend embree")
     elif backend != "embree":
         raise UsdfabError(f"there is no '{backend}'", place="--backend", remedy="choose embree or mitsuba")
-    elif device is not None:
-        raise UsdfabError("is for --backend mitsuba", place="--device")
+    elif device is not None or fibers is not None:
+        raise UsdfabError("is for --backend mitsuba", place="--device" if device is not None else "--fibers")
     target = output or Path(stage.stem + ".png")
     options = picture_options(target, aov, denoise, exposure, view, overwrite)
     part = parse_tile(tile)
@@ -146,12 +150,6 @@ def run(
 
     if backend == "mitsuba":
         from usdfab.cli.render_mitsuba import render_mitsuba
-
-        frame = FrameOptions(settings, window, options, resume, f"rendering {target.name}", quiet, json)
-        facts, warnings, worn = render_mitsuba(source(files[0]), files[0], frame, device or "auto", threads)
-        if json:
-            print_json(facts | {"outputs": [target], "fabric": worn, "warnings": warnings})
-        return
     results, warnings, worn = [], [], None
     place = "local" if scheduler is None and workers is not None else scheduler
     idle = place is None or all(file.finished for file in files)
@@ -159,7 +157,12 @@ def run(
         for k, file in enumerate(files):
             label = f"rendering {file.output.name}" + (f" ({k + 1} of {len(files)})" if len(files) > 1 else "")
             frame = FrameOptions(settings, window, options, resume, label, quiet, json)
-            facts, said, worn_here = render_frame(source(file), file, frame, remote)
+            if backend == "mitsuba":
+                facts, said, worn_here = render_mitsuba(
+                    source(file), file, frame, device or "auto", threads, fibers or "auto"
+                )
+            else:
+                facts, said, worn_here = render_frame(source(file), file, frame, remote)
             results.append(facts)
             warnings += [warning for warning in said if warning not in warnings]
             worn = worn_here or worn

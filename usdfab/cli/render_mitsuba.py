@@ -22,7 +22,7 @@ from usdfab.usd.scene import Scene, Texture
 
 
 def render_mitsuba(
-    source: SceneSource, file: RenderFile, options: FrameOptions, device: str, threads: int | None
+    source: SceneSource, file: RenderFile, options: FrameOptions, device: str, threads: int | None, fibers: str = "auto"
 ) -> tuple[Facts, list[str], str | None]:
     """Render one picture. Returns what ``--json`` says of it, warnings, and the name of the fabric put on."""
     device = resolve_device(device)  # before any work
@@ -34,7 +34,9 @@ def render_mitsuba(
     camera, common = scene.cameras[0], options.settings
     size = resolve_resolution(camera, common.resolution)
     region = resolve_region(options.region.pixels(*size) if options.region else None, *size)
-    settings = MitsubaSettings(size, region, common.spp, common.max_depth, common.seed, device, threads)
+    settings = MitsubaSettings(
+        size, region, common.spp, common.max_depth, common.seed, device, threads, fibers=fibers,  # type: ignore[arg-type]
+    )  # fmt: skip
     with progress_bar(options.label, quiet=options.quiet) as update:
         done = render(scene, camera, settings, pictures=pictures, textures=TextureReader(), progress=update)
     write_pixels(file.output, done.pixels, done.region, done.size, options.picture)
@@ -84,12 +86,14 @@ def _facts(file: RenderFile, done: MitsubaRender) -> Facts:
         "spp": done.spp,
         "noise": None if noise is None else round(noise, 6),
         "seconds": round(done.seconds, 3),
+        "fibers": None if not done.points else "tiled" if done.tiled else "flattened",
         "control_points": done.points,
     }
 
 
 def _line(file: RenderFile, done: MitsubaRender) -> str:
     height, width = done.pixels.shape[:2]
-    points = f", {done.points} control points" if done.points else ""
+    kind = "tiles of" if done.tiled else "fibers of"
+    points = f", {kind} {done.points} control points" if done.points else ""
     what = f"{width} x {height}, {done.spp} spp, {done.seconds:.1f} s"
     return f"wrote {file.output}: {what}, Mitsuba ({done.device}){points}"

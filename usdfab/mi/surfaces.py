@@ -1,10 +1,10 @@
-"""Meshes without fabrics: PLY files, and UsdPreviewSurface as Mitsuba's ``principled``.
+"""Meshes without fabrics: PLY files, and UsdPreviewSurface: our own plugin, or in ``scalar`` Mitsuba's ``principled``.
 
-What differs from the tracer. ``principled`` has Disney's diffuse lobe, which is darker or brighter towards grazing
-angles by its roughness, and its own energy balance between the lobes; its coat is weighted by a quarter and has another
-roughness scale; specularColor is not known to it. So pictures agree to a few percent there, while a surface without
-specular (an index of refraction below 1.07) is exactly Lambert in both. Normal maps are left out. Textures are
-resampled to ``TEXELS`` on a side over what the mesh uses of them.
+What differs from the tracer. Normal maps are left out. Textures are resampled to ``TEXELS`` on a side over what the
+mesh uses of them. In the scalar variant, where no plugin of ours runs: ``principled`` has Disney's diffuse lobe, which
+is darker or brighter towards grazing angles by its roughness, and its own energy balance between the lobes; its coat is
+weighted by a quarter and has another roughness scale; specularColor is not known to it. So pictures agree to a few
+percent there, while a surface without specular (an index of refraction below 1.07) is exactly Lambert in both.
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ _DIFFUSE_BELOW = 1.07
 """Index of refraction below which there is no specular lobe, as in the tracer."""
 
 _KNOWN = ("diffuseColor", "roughness", "metallic", "opacity", "emissiveColor")
+
+_OWN = ("llvm_ad_rgb", "cuda_ad_rgb")
+"""Variants in which our own plugin runs."""
 
 
 def surface_shapes(
@@ -104,8 +107,10 @@ def _look(
     mi: Any, material: Material, uv: Floats | None, textures: TextureReader | None
 ) -> tuple[Description, list[str]]:
     """BSDF and emitter of a material, and what was left out."""
-    warnings = [f"{material.path}: {name} textures are left out" for name in material.textures if name not in _KNOWN]
-    used = {name: t for name, t in material.textures.items() if name in _KNOWN}
+    own = mi.variant() in _OWN
+    known = (*_KNOWN, "specularColor") if own else _KNOWN
+    warnings = [f"{material.path}: {name} textures are left out" for name in material.textures if name not in known]
+    used = {name: t for name, t in material.textures.items() if name in known}
     if used and (textures is None or uv is None):
         warnings.append(f"{material.path}: textures are left out")
         used = {}
@@ -116,10 +121,26 @@ def _look(
         return constant
 
     base = value("diffuseColor", rgb(material.base_color))
-    if material.specular_color is not None:
+    plain = material.metallic == 0.0 and not material.clearcoat and not {"metallic", "specularColor"} & set(used)
+    if material.specular_color is not None and not own:
         warnings.append(f"{material.path}: specularColor is left out")
-    if material.ior < _DIFFUSE_BELOW and material.metallic == 0.0 and not material.clearcoat and "metallic" not in used:
+    if plain and (material.ior == 1.0 and material.specular_color is None if own else material.ior < _DIFFUSE_BELOW):
         bsdf: Description = {"type": "diffuse", "reflectance": base}
+    elif own:
+        from usdfab.mi.surface_bsdf import SURFACE, register_surface_bsdf
+
+        register_surface_bsdf()
+        bsdf = {
+            "type": SURFACE,
+            "base_color": base,
+            "roughness": value("roughness", float(material.roughness), _one),
+            "metallic": value("metallic", float(material.metallic), _one),
+            "ior": float(material.ior),
+            "clearcoat": float(material.clearcoat),
+            "clearcoat_roughness": float(material.clearcoat_roughness),
+        }
+        if material.specular_color is not None:
+            bsdf["specular_color"] = value("specularColor", rgb(material.specular_color))
     else:
         bsdf = {
             "type": "principled",

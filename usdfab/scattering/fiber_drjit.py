@@ -59,8 +59,8 @@ _ETA_MIN = 1.0 + 1e-6
 class PackedFiber(NamedTuple):
     """Constants of a material: Dr.Jit arrays of size 1, or one entry per lane. Lobes R, TT, TRT; the rest has v of TRT.
 
-    They are differentiable functions of the parameters. `tilt` is a plain number and a part of the program: without
-    tilt less is computed.
+    They are differentiable functions of the parameters. `tilt` may be a plain number, which is then a part of the
+    program (without tilt less is computed), or an array where materials of several tilts meet in one program.
     """
 
     sigma: Any  # absorption, three colours
@@ -75,10 +75,15 @@ class PackedFiber(NamedTuple):
     inv_v: tuple[Any, Any, Any]
     m_scale: tuple[Any, Any, Any]  # 1 / (v (1 - e^(-2/v)))
     m_range: tuple[Any, Any, Any]  # 1 - e^(-2/v)
-    tilt: float
+    tilt: Any
+
+    @property
+    def tilted(self) -> bool:
+        """Whether any lane may have a tilt."""
+        return not isinstance(self.tilt, (int, float)) or self.tilt != 0.0
 
     def arrays(self) -> list[Any]:
-        """All Dr.Jit arrays, to be evaluated together."""
+        """All Dr.Jit arrays but the tilt, to be evaluated together."""
         return [self.sigma, *self[1:8], *self.v, *self.inv_v, *self.m_scale, *self.m_range]
 
 
@@ -102,7 +107,7 @@ def absorption_from_albedo(albedo: Any, gamma_n: Any) -> Any:
     return dr.square(dr.log(dr.clip(albedo, _ALBEDO_MIN, 1.0)) / polynomial)
 
 
-def pack_fiber(albedo: Any, gamma_m: Any, gamma_n: Any, gamma_m0: Any, eta: Any, tilt: float = 0.0) -> PackedFiber:
+def pack_fiber(albedo: Any, gamma_m: Any, gamma_n: Any, gamma_m0: Any, eta: Any, tilt: Any = 0.0) -> PackedFiber:
     """Precompute the constants of a fiber material, with gradients.
 
     Parameters
@@ -113,7 +118,7 @@ def pack_fiber(albedo: Any, gamma_m: Any, gamma_n: Any, gamma_m0: Any, eta: Any,
         Longitudinal, azimuthal and primary reflection roughness. Range: [0.01, 1].
     eta: array
         Index of refraction of the fiber over that of the medium around it. Range: (1, inf).
-    tilt: float
+    tilt: float or array
         Cuticle tilt a, rad. Range: [-pi/8, pi/8].
 
     Values outside of a range count as its nearest end and get no gradient: a step of an optimizer that goes too far
@@ -286,9 +291,9 @@ def prepare_fiber(p: PackedFiber, x: Any, sin_to: Any, z: Any) -> PreparedFiber:
 
     # Tilted cuticle: theta_o - 2 a, theta_o + a, theta_o + 4 a; past the pole the cosine keeps its sign positive.
     sin_o, cos_o = [sin_to] * 4, [cos_to] * 4
-    if p.tilt:
+    if p.tilted:
         for k, factor in enumerate((2.0, -1.0, -4.0)):
-            sin_a, cos_a = math.sin(factor * p.tilt), math.cos(factor * p.tilt)
+            sin_a, cos_a = dr.sin(factor * p.tilt), dr.cos(factor * p.tilt)
             sin_o[k] = sin_to * cos_a - cos_to * sin_a
             cos_o[k] = dr.abs(cos_to * cos_a + sin_to * sin_a)
     return PreparedFiber(
@@ -322,10 +327,10 @@ def eval_fiber(p: PackedFiber, prep: PreparedFiber, sin_ti: Any, cos_ti: Any, al
     m: Any = None
     for k in range(4):
         # Without tilt the lobes differ by variance alone, and TRT and the rest have the same M.
-        if k == 0 or p.tilt:
+        if k == 0 or p.tilted:
             distance = _mirror_distance(sin_ti, cos_ti, prep.sin_o[k], prep.cos_o[k])
             cos_cos = cos_ti * prep.cos_o[k]
-        if k < 3 or p.tilt:
+        if k < 3 or p.tilted:
             m = _longitudinal(p, min(k, 2), distance, cos_cos)
         lobe = m * (_azimuthal(p, alpha - prep.center[k]) if k < 3 else _INV_TWO_PI)
         value = value + lobe * prep.attenuation[k]
@@ -361,8 +366,8 @@ def sample_fiber(p: PackedFiber, prep: PreparedFiber, u0: Any, u1: Any, u2: Any)
     left = (u0 - of_lobe(0.0, *bounds)) / dr.maximum(of_lobe(*prep.share), 1e-12)
     v = of_lobe(*p.v, p.v[2])
     m_range = of_lobe(*p.m_range, p.m_range[2])
-    sin_o = of_lobe(*prep.sin_o) if p.tilt else prep.sin_o[0]
-    cos_o = of_lobe(*prep.cos_o) if p.tilt else prep.cos_o[0]
+    sin_o = of_lobe(*prep.sin_o) if p.tilted else prep.sin_o[0]
+    cos_o = of_lobe(*prep.cos_o) if p.tilted else prep.cos_o[0]
 
     # Inclination. M is the distribution of sin(theta_i) of a direction spread around the mirror cone's -theta_o with
     # density ~ e^(cos(x) / v) (von Mises-Fisher): draw 1 - cos(x), then the way around, of which half a turn is enough.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from usdfab.errors import UsdfabError
 from usdfab.tracer.embree import EmbreeScene, add_triangles
 from usdfab.tracer.world import FABRIC_COLUMNS, Macro
+from usdfab.usd.corner_frames import cloth_gradients, face_geometry, smooth_normals
 from usdfab.usd.scene import Mesh, Scene
 
 
@@ -159,15 +160,8 @@ def _mesh_arrays(
     faces = np.zeros((keys, count, 3), dtype=np.float32)
     opened = None
     for key, points in enumerate(_points(mesh, keys)):
-        place = points[mesh.triangles]
-        edges = place[:, 1] - place[:, 0], place[:, 2] - place[:, 0]
+        edges, geometric, double_area = face_geometry(points[mesh.triangles])
         cross = np.cross(*edges)
-        double_area = np.linalg.norm(cross, axis=1)
-        proper = double_area > 0.0
-        if not proper.all():  # Embree never reports triangles without area; keep their numbers finite
-            double_area[~proper] = 1.0
-        geometric = cross / double_area[:, None]
-        geometric[~proper] = 0.0, 0.0, 1.0
         if mesh.normals is None:
             normals = np.repeat(geometric[:, None], 3, axis=1)
         elif key == 0:
@@ -175,51 +169,10 @@ def _mesh_arrays(
         else:
             # Authored normals turn as the smooth normals of the points do.
             assert opened is not None
-            normals = np.asarray(mesh.normals) + _smooth(mesh, cross) - opened
+            normals = np.asarray(mesh.normals) + smooth_normals(mesh, cross) - opened
         if key == 0 and keys == 2 and mesh.normals is not None:
-            opened = _smooth(mesh, cross)
+            opened = smooth_normals(mesh, cross)
         faces[key] = geometric
         corners[key, ..., :3] = normals
-        corners[key, ..., 3:] = _gradients(mesh, edges, geometric, double_area, uv)
+        corners[key, ..., 3:] = cloth_gradients(mesh, edges, geometric, double_area, uv)
     return corners, faces, raw
-
-
-def _smooth(mesh: Mesh, cross: NDArray) -> NDArray[np.float64]:
-    """(T, 3, 3) unit normals at the corners, averaged by area over the triangles at a point."""
-    total = np.zeros_like(mesh.points)
-    for corner in range(3):
-        np.add.at(total, mesh.triangles[:, corner], cross)
-    smooth = total[mesh.triangles]
-    return smooth / np.maximum(np.linalg.norm(smooth, axis=2, keepdims=True), 1e-30)
-
-
-def _gradients(
-    mesh: Mesh, edges: tuple[NDArray, NDArray], normal: NDArray, double_area: NDArray, uv: NDArray
-) -> NDArray[np.float64]:
-    """(T, 3, 6) gradients of the cloth's x and y at the corners, averaged over the triangles at a vertex unless they
-    disagree there (uv seams)."""
-    du, dv = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    # grad f = ((f1 - f0) (e2 x n) + (f2 - f0) (n x e1)) / (2 A) for a linear f on a triangle with e1 x e2 = 2 A n.
-    across = np.cross(edges[1], normal), np.cross(normal, edges[0])
-    gradient = (du[:, :, None] * across[0][:, None] + dv[:, :, None] * across[1][:, None]) / double_area[:, None, None]
-    flat = np.abs(du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]) <= 1e-20
-    if flat.any():  # no Jacobian: the cloth lies there along the first edge, in its own size
-        along = edges[0][flat] / np.maximum(np.linalg.norm(edges[0][flat], axis=1, keepdims=True), 1e-30)
-        gradient[flat] = np.stack([along, np.cross(normal[flat], along)], axis=1)
-    gradient = gradient.reshape(-1, 6)
-    if mesh.normals is None:
-        return np.repeat(gradient[:, None], 3, axis=1)
-    total = np.zeros((len(mesh.points), 7))
-    # Faces without area, and those whose uv say nothing, have no part in their neighbours' cloth.
-    weight = np.where(flat, 0.0, np.linalg.norm(np.cross(*edges), axis=1))
-    weighted = np.c_[gradient, np.ones(len(gradient))] * weight[:, None]
-    for corner in range(3):
-        np.add.at(total, mesh.triangles[:, corner], weighted)
-    smooth = (total[:, :6] / np.maximum(total[:, 6:], 1e-30))[mesh.triangles]
-    agrees = np.ones(smooth.shape[:2], dtype=bool)
-    for part in (slice(0, 3), slice(3, 6)):
-        a, b = smooth[..., part], gradient[:, None, part]
-        scale = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
-        agrees &= np.sum(a * b, axis=-1) > 0.7 * scale
-        agrees &= np.linalg.norm(a, axis=-1) > 0.7 * np.linalg.norm(b, axis=-1)
-    return np.where(agrees[..., None], smooth, gradient[:, None])
