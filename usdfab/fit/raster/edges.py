@@ -87,6 +87,8 @@ def blended(values: Tensor, parts: list[Jumps]) -> Tensor:
         p, q = torch.from_numpy(part.pairs.p), torch.from_numpy(part.pairs.q)
         slope_p = torch.from_numpy(part.smooth_p)[:, None] * (values[p] - values[torch.from_numpy(part.pairs.before)])
         slope_q = torch.from_numpy(part.smooth_q)[:, None] * (values[torch.from_numpy(part.pairs.after)] - values[q])
+        # Not below zero: what is bright at the rim of a fiber only does not run on.
+        slope_p, slope_q = torch.maximum(slope_p, -values[p]), torch.minimum(slope_q, values[q])
         # Integral over x from t to 1/2 of what lies beyond the jump minus what lies before it, x counted from p.
         width = (0.5 - part.t)[:, None]
         at_p = values[q] - slope_q - values[p]

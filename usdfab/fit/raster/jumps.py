@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from usdfab.fit.raster.edges import Ints, Jumps, Pairs, crossing
-from usdfab.fit.raster.hits import Gatherer, Segments, pass_by
+from usdfab.fit.raster.hits import Gatherer, pass_by
 from usdfab.fit.raster.visibility import NOTHING, Seen
 
 Bools = NDArray[np.bool_]
@@ -38,7 +38,7 @@ def jumps(gather: Gatherer, seen: Seen, p: Ints, q: Ints) -> Bools:
 
 
 def visible_edges(
-    gather: Gatherer, seen: Seen, rays: Rays, pairs: Pairs, along_row: bool
+    gather: Gatherer, seen: Seen, shadows: list[Seen], rays: Rays, pairs: Pairs, along_row: bool
 ) -> list[Jumps]:
     """Where between pixels one fiber gives way to another, for ``edges.blended``.
 
@@ -64,10 +64,19 @@ def visible_edges(
     pairs, ends, other = pairs[keep], ends[keep], other[keep]
     t = crossing(*(_showing(gather, seen, rays, ends, other, at) for at in (pairs.p, pairs.q)))
     smooth_p, smooth_q = (
-        (near != far) & ~jumps(gather, seen, near, far)
+        (near != far) & ~jumps(gather, seen, near, far) & _alike(shadows, near, far)
         for near, far in ((pairs.p, pairs.before), (pairs.q, pairs.after))
     )
     return [Jumps(pairs, t, smooth_p, smooth_q)]
+
+
+def _alike(shadows: list[Seen], p: Ints, q: Ints) -> Bools:
+    """(M,) where the same lamps shine on pixels p and q: colours do not run on past the rim of a shadow."""
+    same = np.ones(len(p), dtype=bool)
+    for shadow in shadows:
+        dark = shadow.segment != NOTHING
+        same &= dark[p] == dark[q]
+    return same
 
 
 def _ending(gather: Gatherer, seen: Seen, rays: Rays, pairs: Pairs) -> tuple[Ints, Ints]:
@@ -141,11 +150,14 @@ def shadow_edges(
 
     def cast(at: NDArray[np.int64]) -> Tensor:
         """h of the caster of the shadow, along the ray from what pixel ``at`` sees to the lamp."""
-        s = gather(shadow, rays.start[at], owner)
         place = places[torch.from_numpy(at)]
-        moved = Segments(s.start - place, s.end - place, s.start_tangent, s.end_tangent, s.radius)
         to_lamp = torch.from_numpy((lamp - rays.start[at]) / gather.scale).to(gather.dtype) - place
-        return pass_by(moved, to_lamp / torch.linalg.norm(to_lamp, dim=-1, keepdim=True))[0]
+        to_lamp = to_lamp / torch.linalg.norm(to_lamp, dim=-1, keepdim=True)
+        origin = rays.start[at] + gather.scale * place.detach().numpy()
+        s = gather.beside(shadow, origin, to_lamp.detach(), owner)
+        # ``origin`` carries no gradient: what is left of the place is zero, but its gradient is not.
+        rest = place - place.detach()
+        return pass_by(s._replace(start=s.start - rest, end=s.end - rest), to_lamp)[0]
 
     with torch.no_grad():
         # At r another fiber may be seen: then nothing tells how the rim runs, and rows take it.

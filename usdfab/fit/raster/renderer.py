@@ -108,7 +108,7 @@ class RasterRenderer:
         if self.settings.edges:
             parts = []
             for pairs, along_row in zip(self._pairs, (True, False), strict=True):
-                parts += visible_edges(gather, seen, self._rays, pairs, along_row)
+                parts += visible_edges(gather, seen, shadows, self._rays, pairs, along_row)
             flat = blended(flat, parts)
         return (self._view.gain * look_.gain).to(self._dtype) * flat
 
