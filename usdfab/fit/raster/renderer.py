@@ -11,14 +11,14 @@ from torch import Tensor
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
 from usdfab.fabric.optics import optics_of
+from usdfab.fibers.patch import RASTERIZATION_VERTICES
 from usdfab.fit.raster.curves import CurveModel, Polylines, Shapes, as_numpy, raster_copies
 from usdfab.fit.raster.edges import blended, pixel_pairs
 from usdfab.fit.raster.hits import Gatherer, Meeting, dot, meet
 from usdfab.fit.raster.jumps import Rays, shadow_edges, visible_edges
-from usdfab.fit.raster.shade import Look, Surface, pieces, radiance
+from usdfab.fit.raster.shade import Look, Surface, piece_count, pieces, radiance
 from usdfab.fit.raster.view import View, view_of
 from usdfab.fit.raster.visibility import NOTHING, Seen, index_patch, look
-from usdfab.fibers.patch import RASTERIZATION_VERTICES
 from usdfab.scattering.fiber_torch import pack_fiber
 from usdfab.usd.scene import Camera, Scene
 
@@ -151,19 +151,22 @@ class RasterRenderer:
             diffuse = look_.diffuse[row].to(self._dtype)
             for lamp, position in enumerate(self._view.lamps):
                 bright = mine[as_numpy(lit[:, lamp])[mine] > 0.0]
-                rows = torch.from_numpy(bright)
-                offset = torch.from_numpy((position - starts[bright]) / self._scale).to(self._dtype) - place[rows]
-                squared = dot(offset, offset)
-                to_lamp = offset / torch.sqrt(squared)[:, None]
-                light = sum(
-                    weight[:, None] * radiance(
-                        material if self.settings.single else None, diffuse if self.settings.diffuse else None,
-                        piece, to_lamp, lit[rows, lamp],
-                    )
-                    for piece, weight in pieces(surface[rows])
-                )  # fmt: skip
-                intensity = torch.from_numpy(self._view.intensity[lamp] / self._scale**2).to(self._dtype)
-                total = total.index_add(0, rows, light * intensity / squared[:, None])
+                number = piece_count(surface[torch.from_numpy(bright)]).numpy()
+                for count in np.unique(number):
+                    some = bright[number == count]
+                    rows = torch.from_numpy(some)
+                    offset = torch.from_numpy((position - starts[some]) / self._scale).to(self._dtype) - place[rows]
+                    squared = dot(offset, offset)
+                    to_lamp = offset / torch.sqrt(squared)[:, None]
+                    light = sum(
+                        share[:, None] * radiance(
+                            material if self.settings.single else None, diffuse if self.settings.diffuse else None,
+                            piece, to_lamp, lit[rows, lamp],
+                        )
+                        for piece, share in pieces(surface[rows], int(count))
+                    )  # fmt: skip
+                    intensity = torch.from_numpy(self._view.intensity[lamp] / self._scale**2).to(self._dtype)
+                    total = total.index_add(0, rows, light * intensity / squared[:, None])
         return total
 
 

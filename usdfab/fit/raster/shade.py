@@ -51,19 +51,32 @@ class Surface(NamedTuple):
         return Surface(self.tangent[rows], self.h[rows], self.ray[rows], self.spread[rows])
 
 
-PIECE = 0.7
-"""Widest part of a fiber, in h, over which attenuation and normal are taken as constant."""
+PIECE = 0.45
+"""Widest part of a fiber, in the angle gamma = arc sine of h, over which attenuation and normal count as constant."""
 
 
-def pieces(surface: Surface) -> list[tuple[Surface, Tensor]]:
-    """What pixels see of the fibers' width, cut into parts that are narrow enough, and their weights (N,), sum 1."""
-    low, high = ((surface.h + side * surface.spread).clamp(-1.0 + 1e-6, 1.0 - 1e-6) for side in (-0.5, 0.5))
-    width = high - low
-    number = max(1, math.ceil(float(width.detach().max()) / PIECE - 1e-6)) if len(width) else 1
-    weight = torch.full_like(width, 1.0 / number)
+def piece_count(surface: Surface) -> Tensor:
+    """(N,) int64: into how many parts ``pieces`` should cut what pixels see; near a fiber's side, where most changes,
+    more."""
+    low, high = _gammas(surface)
+    return torch.ceil((high - low).detach() / PIECE).clamp_min(1.0).to(torch.int64)
+
+
+def pieces(surface: Surface, number: int) -> list[tuple[Surface, Tensor]]:
+    """What pixels see of the fibers' width, cut into parts of equal angle, and their shares (N,) of it, sum 1."""
+    low, high = _gammas(surface)
+    bounds = [torch.sin(low + (high - low) * (k / number)) for k in range(number + 1)]
+    width = bounds[-1] - bounds[0]
     return [
-        (surface._replace(h=low + width * ((k + 0.5) / number), spread=width / number), weight) for k in range(number)
+        (surface._replace(h=0.5 * (a + b), spread=b - a), (b - a) / width)
+        for a, b in zip(bounds[:-1], bounds[1:], strict=True)
     ]
+
+
+def _gammas(surface: Surface) -> tuple[Tensor, Tensor]:
+    """The range of the angle gamma that pixels see."""
+    low, high = ((surface.h + side * surface.spread).clamp(-1.0 + 1e-6, 1.0 - 1e-6) for side in (-0.5, 0.5))
+    return torch.asin(low), torch.asin(high)
 
 
 def radiance(

@@ -38,13 +38,15 @@ class Seen:
 class PatchIndex:
     """A patch ready for rays. ``table`` (1, PATCH_COLUMNS) as of the tracer; lengths in its units.
 
-    ``segment`` and ``copy`` tell which segment, shifted by how many patches, an Embree primitive is.
+    ``segment`` and ``copy`` tell which segment, shifted by how many patches, an Embree primitive is; ``curve`` (V,)
+    which fiber a segment belongs to.
     """
 
     scene: EmbreeScene
     table: NDArray[np.float64]
     segment: NDArray[np.int32]
     copy: NDArray[np.int32]
+    curve: NDArray[np.int32]
 
     @property
     def units(self) -> float:
@@ -94,7 +96,7 @@ def index_patch(model: CurveModel, points: NDArray[np.float64], radius: NDArray[
     table[0, [WIDTH, HEIGHT]] = period
     table[0, [LOW, HIGH]] = bottom - 1e-3 * FIBER_RADIUS_UNITS, top + 1e-3 * FIBER_RADIUS_UNITS
     table[0, EPSILON], table[0, UNITS] = 5e-3 * FIBER_RADIUS_UNITS, units
-    return PatchIndex(scene, table, segment.astype(np.int32), copy.astype(np.int32))
+    return PatchIndex(scene, table, segment.astype(np.int32), copy.astype(np.int32), model.curve.astype(np.int32))
 
 
 def look(
@@ -116,7 +118,7 @@ def look(
     segment, copy = np.full((1 + k, n), NOTHING, dtype=np.int32), np.zeros((1 + k, n, 2), dtype=np.int32)
     _look(
         np.uint64(embree.function_addresses()[0]), np.uint64(filter_address()),
-        np.array([index.scene.handle], dtype=np.uint64), index.table, index.segment, index.copy,
+        np.array([index.scene.handle], dtype=np.uint64), index.table, index.segment, index.copy, index.curve,
         index.units * np.asarray(eye, dtype=np.float64), np.ascontiguousarray(directions, dtype=np.float64),
         index.units * np.asarray(lamps, dtype=np.float64).reshape(-1, 3), segment, copy,
     )  # fmt: skip
@@ -127,9 +129,12 @@ def look(
 _ROW = 1024
 """Rays that a thread takes at a time."""
 
+_SELF_HITS = 8
+"""Segments of its own fiber that a shadow ray may pass."""
+
 
 @njit(**KERNEL, parallel=True)
-def _look(trace, filter_function, handles, table, segments, copies, eye, directions, lamps, segment, copy):
+def _look(trace, filter_function, handles, table, segments, copies, curves, eye, directions, lamps, segment, copy):
     count = len(directions)
     for block in prange((count + _ROW - 1) // _ROW):
         memory = new_ray_buffer(filter_function)
@@ -155,11 +160,20 @@ def _look(trace, filter_function, handles, table, segments, copies, eye, directi
                 sy = lamps[lamp, 1] - (ly + iy * height)
                 sz = lamps[lamp, 2] - lz
                 norm = 1.0 / np.sqrt(sx * sx + sy * sy + sz * sz)
-                outcome, _, _, _, _, jx, jy, _ = trace_slab(
-                    trace, table, handles, memory, 0, 1, lx, ly, lz, ix, iy, sx * norm, sy * norm, sz * norm
-                )
-                if outcome == HIT:
+                px, py, pz, jx, jy = lx, ly, lz, ix, iy
+                for _ in range(_SELF_HITS):
+                    outcome, _, px, py, pz, jx, jy, _ = trace_slab(
+                        trace, table, handles, memory, 0, 1, px, py, pz, jx, jy, sx * norm, sy * norm, sz * norm
+                    )
+                    if outcome != HIT:
+                        break
                     hit = np.int64(memory[1][PRIM])
-                    segment[1 + lamp, ray] = segments[hit]
-                    copy[1 + lamp, ray, 0], copy[1 + lamp, ray, 1] = jx + copies[hit, 0], jy + copies[hit, 1]
+                    found, cx, cy = segments[hit], jx + copies[hit, 0], jy + copies[hit, 1]
+                    # Light goes through the fiber that it falls on: that is in its BSDF. On the way it passes the ends
+                    # of the next segments.
+                    own = cx == copy[0, ray, 0] and cy == copy[0, ray, 1]
+                    if not (own and curves[found] == curves[segment[0, ray]]):
+                        segment[1 + lamp, ray] = found
+                        copy[1 + lamp, ray, 0], copy[1 + lamp, ray, 1] = cx, cy
+                        break
         memory[1][0] = np.uint32(0)  # Numba frees an array after its last use: this is after the last ray
