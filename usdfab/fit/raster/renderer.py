@@ -77,7 +77,7 @@ class RasterRenderer:
         self._pixel = float(np.median(steps)) / self._scale
 
     def look_of(self, diffuse: float | np.ndarray = 0.3) -> Look:
-        """The optical parameters of the fabric itself as float64 tensors; ``diffuse`` k_d, of every colour or (K, 3)."""
+        """The optical parameters of the fabric itself as float64 tensors, with k_d ``diffuse`` ((K, 3) or one)."""
         optics = optics_of(self.fabric)
         every = np.broadcast_to(np.asarray(diffuse, dtype=np.float64), optics.albedo.shape).copy()
         numbers = (optics.albedo, every, optics.roughness, optics.ior, np.ones(()))
@@ -151,20 +151,19 @@ class RasterRenderer:
             diffuse = look_.diffuse[row].to(self._dtype)
             for lamp, position in enumerate(self._view.lamps):
                 bright = mine[as_numpy(lit[:, lamp])[mine] > 0.0]
-                number = piece_count(surface[torch.from_numpy(bright)]).numpy()
+                number = piece_count(surface.only(torch.from_numpy(bright))).numpy()
                 for count in np.unique(number):
                     some = bright[number == count]
                     rows = torch.from_numpy(some)
                     offset = torch.from_numpy((position - starts[some]) / self._scale).to(self._dtype) - place[rows]
                     squared = dot(offset, offset)
                     to_lamp = offset / torch.sqrt(squared)[:, None]
-                    light = sum(
-                        share[:, None] * radiance(
+                    light = torch.zeros(len(some), 3, dtype=self._dtype)
+                    for piece, share in pieces(surface.only(rows), int(count)):
+                        light = light + share[:, None] * radiance(
                             material if self.settings.single else None, diffuse if self.settings.diffuse else None,
                             piece, to_lamp, lit[rows, lamp],
-                        )
-                        for piece, share in pieces(surface[rows], int(count))
-                    )  # fmt: skip
+                        )  # fmt: skip
                     intensity = torch.from_numpy(self._view.intensity[lamp] / self._scale**2).to(self._dtype)
                     total = total.index_add(0, rows, light * intensity / squared[:, None])
         return total

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -47,7 +48,8 @@ class Surface(NamedTuple):
     ray: Tensor
     spread: Tensor
 
-    def __getitem__(self, rows: Tensor) -> Surface:  # type: ignore[override]
+    def only(self, rows: Tensor) -> Surface:
+        """Of some of the hits."""
         return Surface(self.tangent[rows], self.h[rows], self.ray[rows], self.spread[rows])
 
 
@@ -67,10 +69,7 @@ def pieces(surface: Surface, number: int) -> list[tuple[Surface, Tensor]]:
     low, high = _gammas(surface)
     bounds = [torch.sin(low + (high - low) * (k / number)) for k in range(number + 1)]
     width = bounds[-1] - bounds[0]
-    return [
-        (surface._replace(h=0.5 * (a + b), spread=b - a), (b - a) / width)
-        for a, b in zip(bounds[:-1], bounds[1:], strict=True)
-    ]
+    return [(surface._replace(h=0.5 * (a + b), spread=b - a), (b - a) / width) for a, b in itertools.pairwise(bounds)]
 
 
 def _gammas(surface: Surface) -> tuple[Tensor, Tensor]:

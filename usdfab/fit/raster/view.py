@@ -57,7 +57,7 @@ def view_of(scene: Scene, camera: Camera, size: tuple[int, int]) -> View:
             "the camera does not look down on the face of the cloth", place=camera.path,
             remedy="put it above the sample, looking at it",
         )  # fmt: skip
-    points = []
+    points, intensity = [], []
     for light in scene.lights:
         if not isinstance(light, PointLight):
             raise UsdfabError(
@@ -65,12 +65,12 @@ def view_of(scene: Scene, camera: Camera, size: tuple[int, int]) -> View:
                 remedy="use a SphereLight with treatAsPoint",
             )  # fmt: skip
         points.append(to_patch @ (light.position - origin[0]) + origin[1])
+        intensity.append(np.asarray(light.intensity, dtype=float))
         if points[-1][2] <= 0.0:
             raise UsdfabError("the lamp is not above the face of the cloth", place=light.path)
     if not points:
         raise UsdfabError("the rig has no lamp", place=scene.path, remedy="add a SphereLight with treatAsPoint")
-    intensity = np.array([np.asarray(light.intensity, dtype=float) for light in scene.lights])
-    return View(eye, directions, np.array(points), intensity, 2.0**camera.exposure)
+    return View(eye, directions, np.array(points), np.array(intensity), 2.0**camera.exposure)
 
 
 def cloth_frame(scene: Scene) -> tuple[Floats, tuple[Floats, Floats]]:
