@@ -57,7 +57,10 @@ def main() -> None:
     parser.add_argument("--sizes", default="360,180,90,45")
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--smoke", action="store_true", help="once and small, to see that it runs")
     arguments = parser.parse_args()
+    if arguments.smoke:
+        arguments.sizes, arguments.runs = "64", 1
     torch.set_num_threads(arguments.threads)
     sizes = [int(s) for s in arguments.sizes.split(",")]
     nets = {dtype: load_features(dtype=dtype) for dtype in DTYPES}

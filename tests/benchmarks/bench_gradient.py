@@ -121,7 +121,9 @@ def compare(case: str, results: dict[str, dict]) -> dict:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="a few seconds once compiled, to see that it runs")
+    parser.add_argument(
+        "--smoke", "--quick", dest="quick", action="store_true", help="a few seconds once compiled, to see that it runs"
+    )
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--renderers", default=",".join(RENDERERS))
     parser.add_argument("--size", type=int, default=128)
