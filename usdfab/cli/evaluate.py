@@ -33,7 +33,7 @@ def run(
         Holds the photos. For photos also SOURCES.csv with the columns file, weave and notes ("about N yarns across
         horizontally and M vertically"); for losses two or more PNG files.
     features:
-        Of losses: the feature network, vgg16, vgg19 or a safetensors file.
+        Of losses: the feature network, vgg16 or a safetensors file of another VGG.
     fast:
         Of losses: compute as the fit does, in bfloat16 where the processor has it.
     """
