@@ -7,7 +7,6 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as load_safetensors
 from torch import Tensor
@@ -105,7 +104,8 @@ def torchvision_convolutions(state: dict[str, Tensor], path: str | Path = "torch
             parts.setdefault(int(match[1]), {})[match[2]] = tensor
         elif not key.startswith("classifier."):
             raise UsdfabError(f"'{key}' belongs to no VGG network of torchvision's", place=str(path))
-    named, block, index, last = {}, 1, 0, -2
+    named: dict[str, Tensor] = {}
+    block, index, last = 1, 0, -2
     for position in sorted(parts):
         # A ReLU lies between two convolutions, a pooling as well where a block ends.
         if position - last not in (2, 3):
