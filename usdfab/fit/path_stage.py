@@ -1,0 +1,346 @@
+"""Stage 3 of the fit: colours and roughnesses refined by differentiable path tracing (Li et al. 2024, 5.5, 7.3).
+
+    result = refine_appearance(fabric, photo, settings=settings_for("standard"), checkpoint="path.npz")
+    better = result.fabric
+
+The geometry is frozen. Adam changes the optics until the render's texture and colour are the photo's. What the paper
+leaves open is settled here: `path_space` keeps parameters in their ranges, `path_passes` says where pictures and
+derivatives come from, `path_fireflies` what is done about noise.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from usdfab.errors import UsdfabError
+from usdfab.fabric import FabricParameters
+from usdfab.fabric.optics import Optics, optics_of, with_optics
+from usdfab.fit.features import FeatureNet, fast_dtype, load_features
+from usdfab.fit.path_checkpoint import State, load_state, save_state
+from usdfab.fit.path_fireflies import Spread
+from usdfab.fit.path_loss import PathLoss, as_tensor
+from usdfab.fit.path_passes import RecycledPasses, Renderer, SeparatePasses, make_renderer
+from usdfab.fit.path_settings import PathSettings
+from usdfab.fit.path_space import OpticsSpace
+from usdfab.fit.texture import Target, smallest_side
+from usdfab.tracer.checkpoint import fingerprint
+from usdfab.usd.rig import swatch_scene
+from usdfab.usd.scene import Camera, Scene
+
+Floats = NDArray[np.float64]
+
+Progress = Callable[[int, int, float], None]
+"""Called with (iterations done, iterations to do, loss)."""
+
+ASPECT_TOLERANCE = 0.02
+MAX_FAILURES = 5
+"""Iterations in a row without a usable picture, loss or gradient after which the stage gives up."""
+
+SAVE_SECONDS = 5.0
+WINDOW = 5
+"""The result is the mean of a fifth of the iterations, those in a row with the least mean loss."""
+
+FIRST_DECAY, SECOND_DECAY, EPSILON = 0.9, 0.999, 1e-8
+"""Adam's (Kingma and Ba 2015)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PathResult:
+    """What stage 3 found.
+
+    Parameters
+    ----------
+    fabric:
+        The refined fabric.
+    gain:
+        By which the render is multiplied to be as bright as the photo.
+    losses: (T, 4)
+        Total, texture, colour and prior of each iteration; not a number where an iteration failed.
+    history: (T, P)
+        ``Optics.vector`` at each iteration.
+    gains: (T,)
+        Exposure gains.
+    names:
+        Of the entries of ``history``.
+    loss:
+        Mean total loss of the iterations that the result is the mean of.
+    paths:
+        Millions of camera paths in this process.
+    seconds:
+        In this process.
+    """
+
+    fabric: FabricParameters
+    gain: float
+    losses: Floats
+    history: Floats
+    gains: Floats
+    names: tuple[str, ...]
+    loss: float
+    paths: float
+    seconds: float
+
+    def summary(self) -> dict[str, object]:
+        """For ``--json``."""
+        finite = self.losses[np.isfinite(self.losses[:, 0])]
+        return {
+            "iterations": len(self.losses),
+            "failed_iterations": len(self.losses) - len(finite),
+            "loss_first": float(finite[0, 0]),
+            "loss": self.loss,
+            "gain": self.gain,
+            "optics": dict(zip(self.names, optics_of(self.fabric).vector().tolist(), strict=True)),
+            "million_paths": self.paths,
+            "seconds": self.seconds,
+        }
+
+
+def start_from_joint(fabric: FabricParameters, diffuse: ArrayLike) -> FabricParameters:
+    """``fabric`` with the albedos that stage 3 starts from: C0 = (C + k_d) / 2 (Li et al. 2024, 7.3).
+
+    Parameters
+    ----------
+    fabric:
+        Stage 2's result.
+    diffuse: (K, 3)
+        k_d of each colour of ``optics_of(fabric)``, or of all.
+    """
+    optics = optics_of(fabric)
+    start = np.clip(0.5 * (optics.albedo + np.asarray(diffuse, dtype=np.float64)), 0.0, 1.0)
+    return with_optics(fabric, Optics(start, optics.system, optics.roughness, optics.ior))
+
+
+def refine_appearance(
+    fabric: FabricParameters,
+    photo: NDArray,
+    *,
+    scene: Scene | None = None,
+    camera: Camera | None = None,
+    settings: PathSettings | None = None,
+    net: FeatureNet | None = None,
+    renderer: Renderer | None = None,
+    checkpoint: str | Path | None = None,
+    progress: Progress | None = None,
+) -> PathResult:
+    """Refine a fabric's colours and roughnesses until its render looks as the photo does.
+
+    Parameters
+    ----------
+    fabric:
+        Where to start; of the geometry and the weave nothing changes.
+    photo: (H, W, 3)
+        Linear Rec. 709, rows from the top, of exactly what the camera sees: ``fabric.size`` under the capture rig.
+    scene:
+        A rig with the fabric on it; by default ``swatch_scene(fabric)``.
+    camera:
+        By default the scene's first.
+    settings:
+        By default those of the quality ``standard``.
+    net:
+        The feature network; by default ``settings.features`` in ``fast_dtype()``.
+    renderer:
+        By default that of ``settings.backend``; another must have the size of :func:`picture_size`.
+    checkpoint:
+        A file that the run is saved to now and then, and goes on from where it exists: to the same result, bit for
+        bit, as without the interruption. It stays; a finished one gives its result at once.
+    progress:
+        Called after each iteration.
+
+    Raises
+    ------
+    UsdfabError
+        For a photo that is no picture, too small or of another aspect than the camera's, a checkpoint of another run,
+        and after ``MAX_FAILURES`` iterations in a row that gave no numbers.
+    """
+    began = time.perf_counter()
+    settings = settings or PathSettings()
+    scene = scene or swatch_scene(fabric)
+    camera = camera or scene.cameras[0]
+    size = picture_size(photo, camera, settings)
+    net = net or load_features(settings.features, dtype=fast_dtype())
+    target = photo_target(photo, size, net, settings.levels)
+    loss = PathLoss(target, fabric.weave.classify(), settings.weights)
+    renderer = renderer or make_renderer(scene, camera, size, settings)
+    space = OpticsSpace.around(renderer.optics)
+    passes: SeparatePasses | RecycledPasses = (
+        RecycledPasses(renderer, settings)  # type: ignore[arg-type]
+        if settings.passes == "recycled"
+        else SeparatePasses(renderer, settings)
+    )
+    state = State.begin(np.append(space.coordinates(space.start), 0.0), settings.rate)
+    file = None if checkpoint is None else Path(checkpoint)
+    identity = "" if file is None else fingerprint(scene, camera, replace(settings, threads=None), np.asarray(photo))
+    if file is not None and file.exists():
+        state, saved = load_state(file, identity)
+        passes.restore(saved)
+    before = state.iteration
+    state = _optimise(state, space, passes, loss, settings, file, identity, progress)
+    point, least = chosen_point(state)
+    found = renderer.optics.with_vector(space.vector(point[:-1]))
+    paths = 1e-6 * size[0] * size[1] * (settings.spp + settings.gradient_spp) * (state.iteration - before)
+    return PathResult(
+        with_optics(fabric, found),
+        float(np.exp(point[-1])),
+        state.losses,
+        np.array([space.vector(row[:-1]) for row in state.history]),
+        np.exp(state.history[:, -1]),
+        renderer.optics.names(),
+        least,
+        paths,
+        time.perf_counter() - began,
+    )
+
+
+def picture_size(photo: NDArray, camera: Camera, settings: PathSettings) -> tuple[int, int]:
+    """(width, height) in pixels of the renders: ``settings.side`` along the longer side, never more than the photo.
+
+    Raises
+    ------
+    UsdfabError
+        For a photo that is no finite RGB picture or whose aspect is not the camera's.
+    """
+    if photo.ndim != 3 or photo.shape[2] != 3 or 0 in photo.shape:
+        raise UsdfabError(f"expected a picture (height, width, 3), got the shape {photo.shape}", place="photo")
+    if not np.isfinite(photo).all():
+        raise UsdfabError("it holds numbers that are not finite", place="photo")
+    height, width = photo.shape[:2]
+    seen = float(camera.tan_half[0] / camera.tan_half[1])
+    if abs(width / height / seen - 1.0) > max(ASPECT_TOLERANCE, 1.0 / min(width, height)):
+        raise UsdfabError(
+            f"it has {width} x {height} pixels, an aspect of {width / height:.3f}, but the camera's is {seen:.3f}",
+            place="photo",
+            remedy="crop the photo to what the camera sees",
+        )
+    factor = min(1.0, settings.side / max(width, height))
+    return max(1, round(width * factor)), max(1, round(height * factor))
+
+
+def photo_target(photo: NDArray, size: tuple[int, int], net: FeatureNet, levels: tuple[int, ...]) -> Target:
+    """The photo's texture at a render's size (width, height), at those levels for which the picture is large enough.
+
+    Raises
+    ------
+    UsdfabError
+        If it is too small for all of them.
+    """
+    pixels = torch.nn.functional.interpolate(as_tensor(photo), (size[1], size[0]), mode="area")
+    fitting = tuple(level for level in levels if smallest_side(net, (level,)) <= min(size))
+    return Target.from_image(pixels, net, fitting or (min(levels),))
+
+
+def chosen_point(state: State) -> tuple[Floats, float]:
+    """The mean point of those iterations in a row, a fifth of all, with the least mean loss; and that loss.
+
+    The least single loss would be that of a lucky picture.
+    """
+    good = np.isfinite(state.losses[:, 0])
+    losses, points = state.losses[good, 0], state.history[good]
+    length = max(1, len(losses) // WINDOW)
+    means = np.convolve(losses, np.full(length, 1.0 / length), mode="valid")
+    first = int(np.argmin(means))
+    return points[first : first + length].mean(axis=0), float(means[first])
+
+
+def _optimise(
+    state: State,
+    space: OpticsSpace,
+    passes: SeparatePasses | RecycledPasses,
+    loss: PathLoss,
+    settings: PathSettings,
+    file: Path | None,
+    identity: str,
+    progress: Progress | None,
+) -> State:
+    """All iterations that are left. An interruption from the keyboard leaves a checkpoint of the last whole one."""
+    saved, kept = time.perf_counter(), passes.state()
+    try:
+        while state.iteration < settings.iterations:
+            state = _step(state, space, passes, loss, settings)
+            kept = passes.state()
+            if progress:
+                progress(state.iteration, settings.iterations, float(state.losses[-1, 0]))
+            if file is not None and time.perf_counter() - saved > SAVE_SECONDS:
+                save_state(file, identity, state, kept)
+                saved = time.perf_counter()
+    finally:
+        if file is not None and state.iteration > 0:
+            save_state(file, identity, state, kept)
+    return state
+
+
+def _step(
+    state: State,
+    space: OpticsSpace,
+    passes: SeparatePasses | RecycledPasses,
+    loss: PathLoss,
+    settings: PathSettings,
+) -> State:
+    """One iteration of Adam; where it gives no numbers, back to the last point that did, with half the rate."""
+    point = state.coordinates
+    vector = space.vector(point[:-1])
+    gradient, row = np.full(len(point), np.nan), np.full(4, np.nan)
+    image = passes.image(vector, state.iteration)
+    if np.isfinite(image).all():
+        gradient, row = _loss_and_gradient(image, vector, point, space, passes, loss, settings)
+    losses, history = np.vstack([state.losses, row]), np.vstack([state.history, point])
+    done = replace(state, iteration=state.iteration + 1, losses=losses, history=history)
+    if not (np.isfinite(gradient).all() and np.isfinite(row).all()):
+        losses[-1] = np.nan
+        failures = state.failures + 1
+        if failures >= MAX_FAILURES:
+            raise UsdfabError(
+                f"{failures} iterations in a row gave no finite picture, loss or gradient",
+                place=f"iteration {done.iteration}",
+                remedy="start from other optics or give more samples",
+            )
+        zero = np.zeros(len(point))
+        return replace(
+            done, failures=failures, rate=0.5 * state.rate, coordinates=state.best.copy(), first=zero, second=zero
+        )
+    if not settings.gain:
+        gradient[-1] = 0.0
+    # Bias correction counts the steps since the moments were zero, which a failure makes them.
+    steps = 1 + int(np.isfinite(state.losses[_after_failure(state.losses) :, 0]).sum())
+    first = FIRST_DECAY * state.first + (1.0 - FIRST_DECAY) * gradient
+    second = SECOND_DECAY * state.second + (1.0 - SECOND_DECAY) * gradient**2
+    mean, square = first / (1.0 - FIRST_DECAY**steps), second / (1.0 - SECOND_DECAY**steps)
+    return replace(
+        done,
+        failures=0,
+        coordinates=point - state.rate * mean / (np.sqrt(square) + EPSILON),
+        first=first,
+        second=second,
+        best=point.copy(),
+    )
+
+
+def _after_failure(losses: Floats) -> int:
+    failed = np.flatnonzero(~np.isfinite(losses[:, 0]))
+    return int(failed[-1]) + 1 if len(failed) else 0
+
+
+def _loss_and_gradient(
+    image: Floats,
+    vector: Floats,
+    point: Floats,
+    space: OpticsSpace,
+    passes: SeparatePasses | RecycledPasses,
+    loss: PathLoss,
+    settings: PathSettings,
+) -> tuple[Floats, Floats]:
+    """(N,) gradient by the coordinates and (4,) losses; not numbers where the loss is none."""
+    spread = Spread.of(image) if settings.spread else None
+    value = loss(spread(image) if spread else image, float(point[-1]), vector[-8:-2].reshape(2, 3))
+    if not value.finite:
+        return np.full(len(point), np.nan), np.full(4, np.nan)
+    by_vector = passes.gradient(spread.transposed(value.adjoint) if spread else value.adjoint)
+    by_vector[-8:-2] += value.roughness.ravel()
+    gradient = np.append(space.slope(point[:-1]) * by_vector[space.free], value.log_gain)
+    return gradient, np.array([value.total, *(value.terms[name] for name in ("texture", "color", "prior"))])
