@@ -25,7 +25,7 @@ def cloth(warp=(0.6, 0.3, 0.2), weft=(0.2, 0.5, 0.6), **changes) -> FabricParame
 
 
 class Stripes:
-    """Pixel = albedo of its system, squared as light that scatters twice, times a lobe as wide as gamma_M.
+    """Pixel = albedo of its system, squared as light that scatters twice, with waves as high as gamma_M.
 
     ``noise`` is the standard deviation of one sample relative to the pixel; ``broken`` holds the numbers of calls that
     give no numbers.
@@ -45,11 +45,12 @@ class Stripes:
         image, slopes = np.zeros((side, side, 3)), np.zeros((len(vector), side, side, 3))
         for system, mask in enumerate((self.warp, 1.0 - self.warp)):
             color, width = vector[3 * system : 3 * system + 3], vector[6 + 3 * system]
-            part = (mask * np.exp(-self.across[system] / width))[..., None]
+            wave = 1.0 - 2.0 * self.across[system]
+            part = (mask * (1.0 + width * wave))[..., None]
             image += part * color**2
             for channel in range(3):
                 slopes[3 * system + channel, ..., channel] = part[..., 0] * 2.0 * color[channel]
-            slopes[6 + 3 * system] = part * color**2 * (self.across[system] / width**2)[..., None]
+            slopes[6 + 3 * system] = (mask * wave)[..., None] * color**2
         return image, slopes
 
     def _grain(self, spp: int, seed: int) -> np.ndarray | float:

@@ -5,14 +5,14 @@ The same as in stage 2 (Li et al. 2024, eq. 12 to 14): texture, mean colour and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from usdfab.fit.losses import roughness_prior
-from usdfab.fit.texture import Target, color_loss, texture_loss
+from usdfab.fit.losses import ROUGHNESS_PRIORS, WIDE_PRIOR, roughness_prior
+from usdfab.fit.texture import Target, color_loss, rolled_off, texture_loss, texture_statistics
 
 Floats = NDArray[np.float64]
 
@@ -82,6 +82,16 @@ class PathLoss:
     weave_class: str
     weights: Weights = Weights()
 
+    def matched(self, photo: Floats, noise: Floats) -> PathLoss:
+        """The loss for pictures with noise: the photo (H, W, 3) is given ``noise`` of the same size and distribution.
+
+        Noise adds to covariances and, through ReLUs and roll-off, to means. With it on both sides it does not pull the
+        optics anywhere.
+        """
+        target = self.target
+        noisy = Target.from_image(as_tensor(photo + noise), target.net, target.levels, target.kind)
+        return replace(self, target=noisy)
+
     def __call__(self, image: Floats, log_gain: float, roughness: Floats) -> LossValue:
         """The loss of ``exp(log_gain) * image``.
 
@@ -115,6 +125,39 @@ class PathLoss:
             float(gain.grad),
             rough.grad.numpy(),
         )
+
+    def residuals(self, images: Floats, log_gain: float) -> list[tuple[torch.Tensor, float]]:
+        """What the texture and colour losses sum the absolute values of: (B, n) differences, and their weight.
+
+        Parameters
+        ----------
+        images: (B, H, W, 3)
+            Linear Rec. 709.
+        """
+        with torch.no_grad():
+            shown = torch.cat([as_tensor(image) for image in images]) * float(np.exp(log_gain))
+            target = self.target
+            found = texture_statistics(shown, target.net, target.levels, target.kind)
+            rows = []
+            for a, b, scale in zip(found, target.statistics, target.scales, strict=True):
+                weight = self.weights.texture / (len(found) * float(scale) * b.numel())
+                rows.append(((a - b).flatten(1), weight))
+            mean = target.mean_color.to(shown)
+            weight = self.weights.color / (3.0 * max(float(mean.mean()), 1e-3))
+            rows.append((rolled_off(shown).mean(dim=(2, 3)) - mean, weight))
+        return rows
+
+    def prior_slope(self, roughness: Floats) -> Floats:
+        """(2, 3) derivatives of the weighted prior by ``Optics.roughness``."""
+        rough = torch.tensor(roughness, dtype=torch.float64, requires_grad=True)
+        (slope,) = torch.autograd.grad(roughness_prior(self.weave_class, rough), rough)
+        return self.weights.prior * slope.numpy()
+
+    def prior_curvature(self) -> Floats:
+        """(6,) second derivatives of the weighted prior by ``Optics.roughness``, row by row."""
+        longitudinal, primary = ROUGHNESS_PRIORS.get(self.weave_class, WIDE_PRIOR)
+        one = np.array([longitudinal[1] ** -2, 0.0, primary[1] ** -2])
+        return self.weights.prior * 0.5 * np.tile(one, 2)
 
 
 def as_tensor(image: NDArray) -> torch.Tensor:

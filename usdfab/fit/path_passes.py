@@ -7,6 +7,7 @@ nearly as much as what the next one renders, and is used again.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +20,32 @@ from usdfab.usd.scene import Camera, Scene
 Floats = NDArray[np.float64]
 
 MEMORY = 0.9
-"""What a pass counts in the next iteration: ten passes together, with the noise of nineteen."""
+"""What a pass counts in the next iteration where optics stand still: the noise is that of nineteen passes."""
+
+STRIDE = 0.03
+"""Relative change of an optical parameter that halves what earlier passes count: derivatives reach only so far."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A noisy picture and a sample of its noise.
+
+    Parameters
+    ----------
+    image: (H, W, 3)
+        Linear Rec. 709.
+    noise: (H, W, 3)
+        Half the difference of the two independent halves of which ``image`` is the mean: as large as the noise in
+        ``image``, uncorrelated with it, and 0 in the mean.
+    """
+
+    image: Floats
+    noise: Floats
+
+    @property
+    def finite(self) -> bool:
+        """Whether all of it are numbers."""
+        return bool(np.isfinite(self.image).all() and np.isfinite(self.noise).all())
 
 
 class Renderer(Protocol):
@@ -71,14 +97,16 @@ class SeparatePasses:
         self._renderer, self._settings = renderer, settings
         self._vector, self._iteration = renderer.optics.vector(), 0
 
-    def image(self, vector: Floats, iteration: int) -> Floats:
-        """The picture (H, W, 3) for these optics (P,)."""
+    def picture(self, vector: Floats, iteration: int) -> Picture:
+        """For these optics (P,)."""
         self._vector, self._iteration = vector, iteration
-        return self._renderer.render(vector, self._settings.spp, pass_seed(self._settings.seed, iteration, 0))
+        half = max(1, self._settings.spp // 2)
+        a, b = (self._renderer.render(vector, half, pass_seed(self._settings.seed, iteration, k)) for k in (0, 1))
+        return Picture(0.5 * (a + b), 0.5 * (a - b))
 
     def gradient(self, adjoint: Floats) -> Floats:
         """(P,) for the picture that was asked for last."""
-        seed = pass_seed(self._settings.seed, self._iteration, 1)
+        seed = pass_seed(self._settings.seed, self._iteration, 2)
         return self._renderer.gradient(self._vector, adjoint, self._settings.gradient_spp, seed)
 
     def state(self) -> dict[str, NDArray]:
@@ -93,31 +121,40 @@ class RecycledPasses:
     """Running means of pictures and of their derivatives, moved along to the optics of each iteration.
 
     With a mean picture I and mean derivatives J at the last optics, I + J d is the picture at optics that differ by d,
-    up to second order; the next pass joins it with the weight of its samples, older ones fade by ``MEMORY``.
+    up to second order; the next pass joins it with the weight of its samples, older ones fade.
     """
 
     def __init__(self, renderer: JacobianRenderer, settings: PathSettings) -> None:
         self._renderer, self._settings = renderer, settings
         width, height = renderer.size
         vector = renderer.optics.vector()
-        self._image = np.zeros((height, width, 3))
+        self._image, self._noise = np.zeros((height, width, 3)), np.zeros((height, width, 3))
         self._jacobian = np.zeros((len(vector), height, width, 3))
         self._vector, self._weight = vector, 0.0
 
-    def image(self, vector: Floats, iteration: int) -> Floats:
-        """The picture (H, W, 3) for these optics (P,)."""
-        spp = self._settings.spp + self._settings.gradient_spp
-        seed = pass_seed(self._settings.seed, iteration, 0)
-        image, jacobian = self._renderer.gradient_images(vector, spp, seed)
-        if not (np.isfinite(image).all() and np.isfinite(jacobian).all()):
-            return image  # the caller takes a step back; the means stay as they are
-        old = MEMORY * self._weight
-        share = spp / (old + spp)
+    def picture(self, vector: Floats, iteration: int) -> Picture:
+        """For these optics (P,)."""
+        half = max(1, (self._settings.spp + self._settings.gradient_spp) // 2)
+        (a, by_a), (b, by_b) = (
+            self._renderer.gradient_images(vector, half, pass_seed(self._settings.seed, iteration, k)) for k in (0, 1)
+        )
+        seen, jacobian = Picture(0.5 * (a + b), 0.5 * (a - b)), 0.5 * (by_a + by_b)
+        if not (seen.finite and np.isfinite(jacobian).all()):
+            return Picture(np.full_like(a, np.nan), seen.noise)  # the means stay as they are
+        moved_by = float(np.max(np.abs(vector - self._vector) / (np.abs(vector) + 0.05)))
+        old = MEMORY * self._weight / (1.0 + (moved_by / STRIDE) ** 2)
+        share = 2 * half / (old + 2 * half)
         moved = self._image + np.tensordot(vector - self._vector, self._jacobian, axes=1)
-        self._image = moved + share * (image - moved)
+        self._image = moved + share * (seen.image - moved)
+        self._noise = self._noise + share * (seen.noise - self._noise)
         self._jacobian = self._jacobian + share * (jacobian - self._jacobian)
-        self._vector, self._weight = vector.copy(), old + spp
-        return self._image
+        self._vector, self._weight = vector.copy(), old + 2 * half
+        return Picture(self._image, self._noise)
+
+    @property
+    def jacobian(self) -> Floats:
+        """(P, H, W, 3) derivatives of the picture that was asked for last."""
+        return self._jacobian
 
     def gradient(self, adjoint: Floats) -> Floats:
         """(P,) for the picture that was asked for last."""
@@ -127,6 +164,7 @@ class RecycledPasses:
         """What the next iteration needs; later iterations leave these arrays as they are."""
         return {
             "mean_image": self._image,
+            "mean_noise": self._noise,
             "mean_jacobian": self._jacobian,
             "mean_vector": self._vector,
             "mean_weight": np.array(self._weight),
@@ -134,7 +172,8 @@ class RecycledPasses:
 
     def restore(self, state: dict[str, NDArray]) -> None:
         """Go on from ``state``."""
-        self._image, self._jacobian = state["mean_image"].copy(), state["mean_jacobian"].copy()
+        self._image, self._noise = state["mean_image"].copy(), state["mean_noise"].copy()
+        self._jacobian = state["mean_jacobian"].copy()
         self._vector, self._weight = state["mean_vector"].copy(), float(state["mean_weight"])
 
 

@@ -12,6 +12,8 @@ from usdfab.fit.texture import LEVELS
 Quality = Literal["draft", "standard", "paper"]
 Backend = Literal["tracer", "mitsuba"]
 Passes = Literal["recycled", "separate"]
+Steps = Literal["model", "adam"]
+Noise = Literal["auto", "denoise", "match", "ignore"]
 
 SIDE_RANGE, ITERATIONS_RANGE, SPP_RANGE = (8, 4096), (1, 10_000), (1, 1 << 16)
 
@@ -25,7 +27,7 @@ class PathSettings:
     side:
         Pixels along the picture's longer side; the photo is reduced to it.
     iterations:
-        Steps of Adam.
+        Renders, each followed by a step.
     spp, gradient_spp:
         Samples per pixel of each picture and of each gradient. With recycled passes both come from the same
         paths, ``spp + gradient_spp`` of them.
@@ -37,6 +39,12 @@ class PathSettings:
         another seed in each iteration, all forgotten in the next.
     spread:
         Whether fireflies are spread before the loss sees the picture, see ``path_fireflies``.
+    steps:
+        ``model``: to where the loss is least by the derivatives of all statistics (Gauss-Newton), at most ``trust``
+        away in each coordinate; needs recycled passes. ``adam``: as the paper.
+    noise:
+        What is done about the render's noise, see ``path_noise``: ``denoise`` it, ``match`` it by noise on the photo,
+        ``ignore`` it. ``auto``: denoise with our tracer where the denoiser is installed, else match.
     keep:
         As for ``DifferentiableTracer``; 1 has no bias.
     gain:
@@ -55,8 +63,6 @@ class PathSettings:
         As for ``Target.from_image``.
     weights:
         Of the parts of the loss.
-    uncertainty:
-        Other draws of the fibers by which uncertainties are estimated; 0 for none.
     threads:
         None: all cores.
     """
@@ -67,7 +73,9 @@ class PathSettings:
     gradient_spp: int = 16
     rate: float = 0.02
     passes: Passes = "recycled"
-    spread: bool = True
+    steps: Steps = "model"
+    trust: float = 0.2
+    noise: Noise = "auto"
     keep: float = 1.0
     gain: bool = True
     max_depth: int = 64
@@ -77,7 +85,6 @@ class PathSettings:
     features: str = "vgg16"
     levels: tuple[int, ...] = LEVELS
     weights: Weights = Weights()
-    uncertainty: int = 2
     threads: int | None = None
 
     def __post_init__(self) -> None:
@@ -86,22 +93,30 @@ class PathSettings:
             ("iterations", self.iterations, ITERATIONS_RANGE),
             ("spp", self.spp, SPP_RANGE),
             ("gradient_spp", self.gradient_spp, SPP_RANGE),
-            ("uncertainty", self.uncertainty, (0, 100)),
         ):
             if not low <= value <= high:
                 raise UsdfabError(f"{value} is not between {low} and {high}", place=name)
         if not 0.0 < self.rate <= 1.0:
             raise UsdfabError(f"got {self.rate}, expected a number above 0, up to 1", place="rate")
-        for name, known in (("passes", get_args(Passes)), ("backend", get_args(Backend))):
+        for name, known in (
+            ("passes", get_args(Passes)),
+            ("backend", get_args(Backend)),
+            ("steps", get_args(Steps)),
+            ("noise", get_args(Noise)),
+        ):
             if getattr(self, name) not in known:
                 raise UsdfabError(
                     f"there is no '{getattr(self, name)}'", place=name, remedy=f"choose {' or '.join(known)}"
                 )
+        if not 0.0 < self.trust <= 2.0:
+            raise UsdfabError(f"got {self.trust}, expected a number above 0, up to 2", place="trust")
+        if self.steps == "model" and self.passes != "recycled":
+            raise UsdfabError("model steps need recycled passes", place="steps", remedy="use adam")
         if self.backend == "mitsuba" and (self.passes != "separate" or self.keep != 1.0):
             raise UsdfabError(
                 "Mitsuba gives no derivative of each pixel, and none with a fading drift",
                 place="backend",
-                remedy="use passes='separate' and keep=1, as settings_for(quality, backend='mitsuba') does",
+                remedy="use passes='separate', steps='adam' and keep=1",
             )
 
     @property
@@ -111,9 +126,9 @@ class PathSettings:
 
 
 QUALITIES: dict[Quality, PathSettings] = {
-    "draft": PathSettings(side=96, iterations=30, spp=6, gradient_spp=4, uncertainty=0, rate=0.04),
+    "draft": PathSettings(side=96, iterations=30, spp=6, gradient_spp=4, rate=0.04),
     "standard": PathSettings(side=128, iterations=50, spp=24, gradient_spp=12),
-    "paper": PathSettings(side=720, iterations=50, spp=1024, gradient_spp=256, passes="separate", uncertainty=3),
+    "paper": PathSettings(side=720, iterations=50, spp=1024, gradient_spp=256, passes="separate", steps="adam"),
 }
 """Draft and standard take about 1 and 6 minutes on two cores at 10 to 20 CPU seconds per million paths."""
 
@@ -129,5 +144,5 @@ def settings_for(quality: Quality = "standard", **changes: object) -> PathSettin
     if quality not in QUALITIES:
         raise UsdfabError(f"there is no quality '{quality}'", remedy=f"choose {', '.join(QUALITIES)}")
     if changes.get("backend") == "mitsuba":
-        changes = {"passes": "separate"} | changes
+        changes = {"passes": "separate", "steps": "adam"} | changes
     return replace(QUALITIES[quality], **changes)  # type: ignore[arg-type]

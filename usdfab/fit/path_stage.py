@@ -24,12 +24,14 @@ from usdfab.fabric import FabricParameters
 from usdfab.fabric.optics import Optics, optics_of, with_optics
 from usdfab.fit.features import FeatureNet, fast_dtype, load_features
 from usdfab.fit.path_checkpoint import State, load_state, save_state
-from usdfab.fit.path_fireflies import Spread
 from usdfab.fit.path_loss import PathLoss, as_tensor
-from usdfab.fit.path_passes import RecycledPasses, Renderer, SeparatePasses, make_renderer
+from usdfab.fit.path_noise import Cleaned, Denoised, Spread, spread
+from usdfab.fit.path_passes import Picture, RecycledPasses, Renderer, SeparatePasses, make_renderer
 from usdfab.fit.path_settings import PathSettings
 from usdfab.fit.path_space import OpticsSpace
+from usdfab.fit.path_steps import adam_step, gradient_by_point, model_step
 from usdfab.fit.texture import Target, smallest_side
+from usdfab.imaging.denoise import check_denoiser, denoise
 from usdfab.tracer.checkpoint import fingerprint
 from usdfab.usd.rig import swatch_scene
 from usdfab.usd.scene import Camera, Scene
@@ -46,9 +48,6 @@ MAX_FAILURES = 5
 SAVE_SECONDS = 5.0
 WINDOW = 5
 """The result is the mean of a fifth of the iterations, those in a row with the least mean loss."""
-
-FIRST_DECAY, SECOND_DECAY, EPSILON = 0.9, 0.999, 1e-8
-"""Adam's (Kingma and Ba 2015)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +143,7 @@ def refine_appearance(
     settings:
         By default those of the quality ``standard``.
     net:
-        The feature network; by default ``settings.features`` in ``fast_dtype()``.
+        The feature network; by default ``settings.features``.
     renderer:
         By default that of ``settings.backend``; another must have the size of :func:`picture_size`.
     checkpoint:
@@ -164,10 +163,15 @@ def refine_appearance(
     scene = scene or swatch_scene(fabric)
     camera = camera or scene.cameras[0]
     size = picture_size(photo, camera, settings)
-    net = net or load_features(settings.features, dtype=fast_dtype())
-    target = photo_target(photo, size, net, settings.levels)
-    loss = PathLoss(target, fabric.weave.classify(), settings.weights)
+    # Differences of statistics need all digits.
+    dtype = torch.float32 if settings.steps == "model" else fast_dtype()
+    net = net or load_features(settings.features, dtype=dtype)
     renderer = renderer or make_renderer(scene, camera, size, settings)
+    settings, clean = _noise_treatment(renderer, settings)
+    small = reduced_photo(photo, size)
+    if settings.noise != "ignore":
+        small = Spread.of(small).image  # what is done to the render's highlights is done to the photo's
+    loss = PathLoss(photo_target(small, net, settings.levels), fabric.weave.classify(), settings.weights)
     space = OpticsSpace.around(renderer.optics)
     passes: SeparatePasses | RecycledPasses = (
         RecycledPasses(renderer, settings)  # type: ignore[arg-type]
@@ -181,7 +185,7 @@ def refine_appearance(
         state, saved = load_state(file, identity)
         passes.restore(saved)
     before = state.iteration
-    state = _optimise(state, space, passes, loss, settings, file, identity, progress)
+    state = _optimise(state, space, passes, loss, clean, small, settings, file, identity, progress)
     point, least = chosen_point(state)
     found = renderer.optics.with_vector(space.vector(point[:-1]))
     paths = 1e-6 * size[0] * size[1] * (settings.spp + settings.gradient_spp) * (state.iteration - before)
@@ -222,17 +226,22 @@ def picture_size(photo: NDArray, camera: Camera, settings: PathSettings) -> tupl
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
-def photo_target(photo: NDArray, size: tuple[int, int], net: FeatureNet, levels: tuple[int, ...]) -> Target:
-    """The photo's texture at a render's size (width, height), at those levels for which the picture is large enough.
+def reduced_photo(photo: NDArray, size: tuple[int, int]) -> Floats:
+    """The photo (H, W, 3) averaged over the pixels of a render of a size (width, height)."""
+    pixels = torch.nn.functional.interpolate(as_tensor(photo), (size[1], size[0]), mode="area")
+    return np.moveaxis(pixels[0].double().numpy(), 0, -1)
+
+
+def photo_target(photo: Floats, net: FeatureNet, levels: tuple[int, ...]) -> Target:
+    """The photo's texture at those levels for which it is large enough.
 
     Raises
     ------
     UsdfabError
         If it is too small for all of them.
     """
-    pixels = torch.nn.functional.interpolate(as_tensor(photo), (size[1], size[0]), mode="area")
-    fitting = tuple(level for level in levels if smallest_side(net, (level,)) <= min(size))
-    return Target.from_image(pixels, net, fitting or (min(levels),))
+    fitting = tuple(level for level in levels if smallest_side(net, (level,)) <= min(photo.shape[:2]))
+    return Target.from_image(as_tensor(photo), net, fitting or (min(levels),))
 
 
 def chosen_point(state: State) -> tuple[Floats, float]:
@@ -248,11 +257,48 @@ def chosen_point(state: State) -> tuple[Floats, float]:
     return points[first : first + length].mean(axis=0), float(means[first])
 
 
+def _noise_treatment(renderer: Renderer, settings: PathSettings) -> tuple[PathSettings, Callable[[Picture], Cleaned]]:
+    """The settings with ``auto`` replaced, and how pictures are made fit for the loss.
+
+    Raises
+    ------
+    UsdfabError
+        Where denoising is asked for and the denoiser is missing, or the renderer has no guides for it.
+    """
+    how = settings.noise
+    if how == "auto":
+        able = hasattr(renderer, "guides") and denoiser_installed()
+        how = "denoise" if able else "match"
+    settings = replace(settings, noise=how)
+    if how == "ignore":
+        return settings, lambda picture: Spread(picture.image, np.ones((*picture.image.shape[:2], 1)))
+    if how == "match":
+        return settings, lambda picture: Spread.of(picture.image)
+    check_denoiser()
+    if not hasattr(renderer, "guides"):
+        raise UsdfabError("this renderer has no guides for the denoiser", place="noise", remedy="use match")
+    albedo, normal = renderer.guides()
+    return settings, lambda picture: Denoised.of(
+        picture.image, lambda image: denoise(image, albedo, normal).astype(np.float64)
+    )
+
+
+def denoiser_installed() -> bool:
+    """Whether pictures can be denoised here."""
+    try:
+        check_denoiser()
+    except UsdfabError:
+        return False
+    return True
+
+
 def _optimise(
     state: State,
     space: OpticsSpace,
     passes: SeparatePasses | RecycledPasses,
     loss: PathLoss,
+    clean: Callable[[Picture], Cleaned],
+    photo: Floats,
     settings: PathSettings,
     file: Path | None,
     identity: str,
@@ -262,7 +308,7 @@ def _optimise(
     saved, kept = time.perf_counter(), passes.state()
     try:
         while state.iteration < settings.iterations:
-            state = _step(state, space, passes, loss, settings)
+            state = _step(state, space, passes, loss, clean, photo, settings)
             kept = passes.state()
             if progress:
                 progress(state.iteration, settings.iterations, float(state.losses[-1, 0]))
@@ -280,19 +326,38 @@ def _step(
     space: OpticsSpace,
     passes: SeparatePasses | RecycledPasses,
     loss: PathLoss,
+    clean: Callable[[Picture], Cleaned],
+    photo: Floats,
     settings: PathSettings,
 ) -> State:
-    """One iteration of Adam; where it gives no numbers, back to the last point that did, with half the rate."""
+    """One iteration; where it gives no numbers, back to the last point that did, with shorter steps."""
     point = state.coordinates
     vector = space.vector(point[:-1])
-    gradient, row = np.full(len(point), np.nan), np.full(4, np.nan)
-    image = passes.image(vector, state.iteration)
-    if np.isfinite(image).all():
-        gradient, row = _loss_and_gradient(image, vector, point, space, passes, loss, settings)
-    losses, history = np.vstack([state.losses, row]), np.vstack([state.history, point])
-    done = replace(state, iteration=state.iteration + 1, losses=losses, history=history)
-    if not (np.isfinite(gradient).all() and np.isfinite(row).all()):
-        losses[-1] = np.nan
+    picture = passes.picture(vector, state.iteration)
+    value, change, gradient = None, np.zeros(len(point)), np.zeros(len(point))
+    if picture.finite:
+        cleaned = clean(picture)
+        if settings.noise == "match":
+            scaled = np.exp(point[-1]) * picture.noise
+            loss = loss.matched(photo, spread(scaled, cleaned.kept) if isinstance(cleaned, Spread) else scaled)
+        value = loss(cleaned.image, float(point[-1]), vector[-8:-2].reshape(2, 3))
+        if value.finite and isinstance(passes, RecycledPasses) and settings.steps == "model":
+            jacobian = cleaned.derivatives(passes.jacobian)
+            trust = settings.trust * state.rate / settings.rate
+            change = model_step(cleaned.image, jacobian, point, space, loss, trust, settings.gain)
+        elif value.finite:
+            by_vector = passes.gradient(cleaned.transposed(value.adjoint))
+            gradient = gradient_by_point(value, by_vector, space, point, settings.gain)
+    good = value is not None and value.finite and bool(np.isfinite(gradient).all() and np.isfinite(change).all())
+    row = [value.total, *(value.terms[k] for k in ("texture", "color", "prior"))] if good and value else [np.nan] * 4
+    done = replace(
+        state,
+        iteration=state.iteration + 1,
+        losses=np.vstack([state.losses, row]),
+        history=np.vstack([state.history, point]),
+    )
+    zero = np.zeros(len(point))
+    if not good:
         failures = state.failures + 1
         if failures >= MAX_FAILURES:
             raise UsdfabError(
@@ -300,47 +365,17 @@ def _step(
                 place=f"iteration {done.iteration}",
                 remedy="start from other optics or give more samples",
             )
-        zero = np.zeros(len(point))
         return replace(
             done, failures=failures, rate=0.5 * state.rate, coordinates=state.best.copy(), first=zero, second=zero
         )
-    if not settings.gain:
-        gradient[-1] = 0.0
-    # Bias correction counts the steps since the moments were zero, which a failure makes them.
-    steps = 1 + int(np.isfinite(state.losses[_after_failure(state.losses) :, 0]).sum())
-    first = FIRST_DECAY * state.first + (1.0 - FIRST_DECAY) * gradient
-    second = SECOND_DECAY * state.second + (1.0 - SECOND_DECAY) * gradient**2
-    mean, square = first / (1.0 - FIRST_DECAY**steps), second / (1.0 - SECOND_DECAY**steps)
-    return replace(
-        done,
-        failures=0,
-        coordinates=point - state.rate * mean / (np.sqrt(square) + EPSILON),
-        first=first,
-        second=second,
-        best=point.copy(),
-    )
+    first, second = state.first, state.second
+    if settings.steps == "adam":
+        # Bias correction counts the steps since the moments were zero, which a failure makes them.
+        steps = 1 + len(state.losses) - _after_failure(state.losses)
+        change, first, second = adam_step(gradient, first, second, steps, state.rate)
+    return replace(done, failures=0, coordinates=point + change, first=first, second=second, best=point.copy())
 
 
 def _after_failure(losses: Floats) -> int:
     failed = np.flatnonzero(~np.isfinite(losses[:, 0]))
     return int(failed[-1]) + 1 if len(failed) else 0
-
-
-def _loss_and_gradient(
-    image: Floats,
-    vector: Floats,
-    point: Floats,
-    space: OpticsSpace,
-    passes: SeparatePasses | RecycledPasses,
-    loss: PathLoss,
-    settings: PathSettings,
-) -> tuple[Floats, Floats]:
-    """(N,) gradient by the coordinates and (4,) losses; not numbers where the loss is none."""
-    spread = Spread.of(image) if settings.spread else None
-    value = loss(spread(image) if spread else image, float(point[-1]), vector[-8:-2].reshape(2, 3))
-    if not value.finite:
-        return np.full(len(point), np.nan), np.full(4, np.nan)
-    by_vector = passes.gradient(spread.transposed(value.adjoint) if spread else value.adjoint)
-    by_vector[-8:-2] += value.roughness.ravel()
-    gradient = np.append(space.slope(point[:-1]) * by_vector[space.free], value.log_gain)
-    return gradient, np.array([value.total, *(value.terms[name] for name in ("texture", "color", "prior"))])
