@@ -37,7 +37,7 @@ class Stripes:
         self.noise, self.broken, self.calls = noise, set(broken), 0
         y, x = (np.mgrid[:side, :side] + 0.5) / side
         self.warp = (np.sin(8 * np.pi * x) * np.sin(8 * np.pi * y) > 0).astype(float)
-        self.across = [np.sin(16 * np.pi * x) ** 2, np.sin(16 * np.pi * y) ** 2]
+        self.across = [np.sin(4 * np.pi * x) ** 2, np.sin(4 * np.pi * y) ** 2]
 
     def exact(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The picture (H, W, 3) and its derivatives (P, H, W, 3) without noise."""
