@@ -17,9 +17,9 @@ from small_network import small_net
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric.optics import optics_of, with_optics
-from usdfab.fit import path_stage
+from usdfab.fit import path_photo, path_stage
 from usdfab.fit.features import FeatureNet
-from usdfab.fit.path_loss import PathLoss
+from usdfab.fit.path_loss import PathLoss, Weights
 from usdfab.fit.path_noise import Denoised, Spread, spread
 from usdfab.fit.path_passes import RecycledPasses, SeparatePasses
 from usdfab.fit.path_settings import PathSettings, settings_for
@@ -29,7 +29,16 @@ from usdfab.usd.rig import swatch_scene
 
 TRUTH = cloth()
 START = cloth((0.5, 0.36, 0.26), (0.26, 0.42, 0.5), roughness_longitudinal=0.4)
-SMALL = PathSettings(side=SIDE, iterations=8, spp=16, gradient_spp=16, levels=(1, 2), gain=False, noise="match")
+SMALL = PathSettings(
+    side=SIDE,
+    iterations=8,
+    spp=16,
+    gradient_spp=16,
+    levels=(1, 2),
+    gain=False,
+    noise="match",
+    weights=Weights(anchor=0.0),
+)
 ADAM = replace(SMALL, steps="adam", passes="separate", iterations=40, rate=0.05)
 
 
@@ -72,6 +81,17 @@ def test_known_optics_are_found(settings, photo, net) -> None:
     assert result.gain == 1.0 and set(result.summary()["optics"]) == set(result.names)
 
 
+def test_what_the_picture_does_not_show_stays(photo, net) -> None:
+    """gamma_N and gamma_M0 change nothing in stripes; their uncertainty is their whole range, that of albedo small."""
+    result = refined(photo, net, replace(SMALL, weights=Weights()), noise=0.3)
+    unseen = [7, 8, 10, 11]
+    start = optics_of(START).vector()
+    np.testing.assert_allclose(optics_of(result.fabric).vector()[unseen], start[unseen], atol=0.005)
+    assert result.uncertainty.shape == (14,) and (result.uncertainty[12:] == 0.0).all()
+    assert result.uncertainty[unseen].min() > 3.0 * result.uncertainty[:6].max() > 0.0
+    assert np.isnan(refined(photo, net, replace(ADAM, iterations=2)).uncertainty[:12]).all()
+
+
 @pytest.mark.parametrize("settings", [replace(SMALL, iterations=16), ADAM], ids=["model", "adam"])
 def test_with_noise_albedo_comes_back(settings, photo, net) -> None:
     result = refined(photo, net, settings, noise=0.6)
@@ -90,7 +110,7 @@ def test_matched_noise_pulls_less_than_ignored_noise(photo, net) -> None:
     """Where is the loss of noisy pictures least? Noise looks like contrast, so ignoring it makes gamma_M too small."""
     vector = optics_of(TRUTH).vector()
     widths = np.linspace(0.3, 0.7, 9)
-    plain = PathLoss(path_stage.photo_target(photo, net, (1, 2)), "plain")
+    plain = PathLoss(path_photo.photo_target(photo, net, (1, 2)), "plain")
     total = {"match": np.zeros(len(widths)), "ignore": np.zeros(len(widths))}
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -285,10 +305,10 @@ def test_photos_that_do_not_fit(photo, net) -> None:
 def test_a_larger_photo_is_reduced_and_the_levels_are_those_that_fit(photo, net) -> None:
     camera = swatch_scene(START).cameras[0]
     large = np.kron(photo, np.ones((3, 3, 1)))
-    assert path_stage.picture_size(large, camera, SMALL) == (SIDE, SIDE)
-    assert path_stage.picture_size(photo[:16, :16], camera, SMALL) == (16, 16)
-    np.testing.assert_allclose(path_stage.reduced_photo(large, (SIDE, SIDE)), photo, atol=1e-6)
-    assert path_stage.photo_target(photo, net, (1, 2, 64)).levels == (1, 2)
+    assert path_photo.picture_size(large, camera, SMALL) == (SIDE, SIDE)
+    assert path_photo.picture_size(photo[:16, :16], camera, SMALL) == (16, 16)
+    np.testing.assert_allclose(path_photo.reduced_photo(large, (SIDE, SIDE)), photo, atol=1e-6)
+    assert path_photo.photo_target(photo, net, (1, 2, 64)).levels == (1, 2)
 
 
 def test_settings_out_of_range() -> None:

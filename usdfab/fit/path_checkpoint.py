@@ -34,6 +34,8 @@ class State:
         Total, texture, colour and prior of each iteration; not a number where it failed.
     history: (T, N)
         Points whose losses these are.
+    curvature: (N, N)
+        Of the loss at the last point; 0 where it is not known.
     """
 
     iteration: int
@@ -45,6 +47,7 @@ class State:
     best: Floats
     losses: Floats
     history: Floats
+    curvature: Floats
 
     @classmethod
     def begin(cls, coordinates: Floats, rate: float) -> State:
@@ -52,7 +55,7 @@ class State:
         n = len(coordinates)
         return cls(
             0, 0, rate, coordinates.copy(), np.zeros(n), np.zeros(n), coordinates.copy(), np.zeros((0, 4)),
-            np.zeros((0, n)),
+            np.zeros((0, n)), np.zeros((n, n)),
         )  # fmt: skip
 
 

@@ -19,9 +19,10 @@ from usdfab.fabric.optics import ROUGHNESSES, optics_of, with_optics
 from usdfab.fabric.parameters import PARAMETER_BY_NAME
 from usdfab.fabric.sampling import sample_fabric
 from usdfab.fit.path_noise import Denoised
+from usdfab.fit.path_result import PathResult
 from usdfab.fit.path_settings import PathSettings
 from usdfab.fit.path_space import OpticsSpace
-from usdfab.fit.path_stage import PathResult, Progress, denoiser_installed, refine_appearance
+from usdfab.fit.path_stage import Progress, denoiser_installed, refine_appearance
 from usdfab.imaging.denoise import denoise
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import swatch_scene

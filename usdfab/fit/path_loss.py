@@ -20,13 +20,22 @@ GAIN_DEVIATION = 0.1
 """Standard deviation of the logarithm of the exposure gain: brighter light and whiter fibers look much alike."""
 
 
+ANCHOR_DEVIATION = 0.5
+"""Of the coordinates of ``OpticsSpace`` from those of the start: 0.12 for an albedo of 0.5."""
+
+
 @dataclass(frozen=True)
 class Weights:
-    """How much the parts of the loss count."""
+    """How much the parts of the loss count.
+
+    ``anchor`` is half the square of how far the coordinates are from the start, in ``ANCHOR_DEVIATION``: what the
+    picture hardly shows stays where earlier stages have seen it.
+    """
 
     texture: float = 1.0
     color: float = 1.0
     prior: float = 0.02
+    anchor: float = 0.02
 
 
 @dataclass(frozen=True, eq=False)

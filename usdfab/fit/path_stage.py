@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +24,14 @@ from usdfab.fabric import FabricParameters
 from usdfab.fabric.optics import Optics, optics_of, with_optics
 from usdfab.fit.features import FeatureNet, fast_dtype, load_features
 from usdfab.fit.path_checkpoint import State, load_state, save_state
-from usdfab.fit.path_loss import PathLoss, as_tensor
+from usdfab.fit.path_loss import PathLoss
 from usdfab.fit.path_noise import Cleaned, Denoised, Spread, spread
 from usdfab.fit.path_passes import Picture, RecycledPasses, Renderer, SeparatePasses, make_renderer
+from usdfab.fit.path_photo import photo_target, picture_size, reduced_photo
+from usdfab.fit.path_result import PathResult, chosen_point, uncertainty_of
 from usdfab.fit.path_settings import PathSettings
 from usdfab.fit.path_space import OpticsSpace
-from usdfab.fit.path_steps import adam_step, gradient_by_point, model_step
-from usdfab.fit.texture import Target, smallest_side
+from usdfab.fit.path_steps import adam_step, anchor_loss, gradient_by_point, model_step
 from usdfab.imaging.denoise import check_denoiser, denoise
 from usdfab.tracer.checkpoint import fingerprint
 from usdfab.usd.rig import swatch_scene
@@ -41,64 +42,10 @@ Floats = NDArray[np.float64]
 Progress = Callable[[int, int, float], None]
 """Called with (iterations done, iterations to do, loss)."""
 
-ASPECT_TOLERANCE = 0.02
 MAX_FAILURES = 5
 """Iterations in a row without a usable picture, loss or gradient after which the stage gives up."""
 
 SAVE_SECONDS = 5.0
-WINDOW = 5
-"""The result is the mean of a fifth of the iterations, those in a row with the least mean loss."""
-
-
-@dataclass(frozen=True, eq=False)
-class PathResult:
-    """What stage 3 found.
-
-    Parameters
-    ----------
-    fabric:
-        The refined fabric.
-    gain:
-        By which the render is multiplied to be as bright as the photo.
-    losses: (T, 4)
-        Total, texture, colour and prior of each iteration; not a number where an iteration failed.
-    history: (T, P)
-        ``Optics.vector`` at each iteration.
-    gains: (T,)
-        Exposure gains.
-    names:
-        Of the entries of ``history``.
-    loss:
-        Mean total loss of the iterations that the result is the mean of.
-    paths:
-        Millions of camera paths in this process.
-    seconds:
-        In this process.
-    """
-
-    fabric: FabricParameters
-    gain: float
-    losses: Floats
-    history: Floats
-    gains: Floats
-    names: tuple[str, ...]
-    loss: float
-    paths: float
-    seconds: float
-
-    def summary(self) -> dict[str, object]:
-        """For ``--json``."""
-        finite = self.losses[np.isfinite(self.losses[:, 0])]
-        return {
-            "iterations": len(self.losses),
-            "failed_iterations": len(self.losses) - len(finite),
-            "loss_first": float(finite[0, 0]),
-            "loss": self.loss,
-            "gain": self.gain,
-            "optics": dict(zip(self.names, optics_of(self.fabric).vector().tolist(), strict=True)),
-            "million_paths": self.paths,
-            "seconds": self.seconds,
-        }
 
 
 def start_from_joint(fabric: FabricParameters, diffuse: ArrayLike) -> FabricParameters:
@@ -196,65 +143,11 @@ def refine_appearance(
         np.array([space.vector(row[:-1]) for row in state.history]),
         np.exp(state.history[:, -1]),
         renderer.optics.names(),
+        uncertainty_of(state.curvature, point, least, space),
         least,
         paths,
         time.perf_counter() - began,
     )
-
-
-def picture_size(photo: NDArray, camera: Camera, settings: PathSettings) -> tuple[int, int]:
-    """(width, height) in pixels of the renders: ``settings.side`` along the longer side, never more than the photo.
-
-    Raises
-    ------
-    UsdfabError
-        For a photo that is no finite RGB picture or whose aspect is not the camera's.
-    """
-    if photo.ndim != 3 or photo.shape[2] != 3 or 0 in photo.shape:
-        raise UsdfabError(f"expected a picture (height, width, 3), got the shape {photo.shape}", place="photo")
-    if not np.isfinite(photo).all():
-        raise UsdfabError("it holds numbers that are not finite", place="photo")
-    height, width = photo.shape[:2]
-    seen = float(camera.tan_half[0] / camera.tan_half[1])
-    if abs(width / height / seen - 1.0) > max(ASPECT_TOLERANCE, 1.0 / min(width, height)):
-        raise UsdfabError(
-            f"it has {width} x {height} pixels, an aspect of {width / height:.3f}, but the camera's is {seen:.3f}",
-            place="photo",
-            remedy="crop the photo to what the camera sees",
-        )
-    factor = min(1.0, settings.side / max(width, height))
-    return max(1, round(width * factor)), max(1, round(height * factor))
-
-
-def reduced_photo(photo: NDArray, size: tuple[int, int]) -> Floats:
-    """The photo (H, W, 3) averaged over the pixels of a render of a size (width, height)."""
-    pixels = torch.nn.functional.interpolate(as_tensor(photo), (size[1], size[0]), mode="area")
-    return np.moveaxis(pixels[0].double().numpy(), 0, -1)
-
-
-def photo_target(photo: Floats, net: FeatureNet, levels: tuple[int, ...]) -> Target:
-    """The photo's texture at those levels for which it is large enough.
-
-    Raises
-    ------
-    UsdfabError
-        If it is too small for all of them.
-    """
-    fitting = tuple(level for level in levels if smallest_side(net, (level,)) <= min(photo.shape[:2]))
-    return Target.from_image(as_tensor(photo), net, fitting or (min(levels),))
-
-
-def chosen_point(state: State) -> tuple[Floats, float]:
-    """The mean point of those iterations in a row, a fifth of all, with the least mean loss; and that loss.
-
-    The least single loss would be that of a lucky picture.
-    """
-    good = np.isfinite(state.losses[:, 0])
-    losses, points = state.losses[good, 0], state.history[good]
-    length = max(1, len(losses) // WINDOW)
-    means = np.convolve(losses, np.full(length, 1.0 / length), mode="valid")
-    first = int(np.argmin(means))
-    return points[first : first + length].mean(axis=0), float(means[first])
 
 
 def _noise_treatment(renderer: Renderer, settings: PathSettings) -> tuple[PathSettings, Callable[[Picture], Cleaned]]:
@@ -334,7 +227,7 @@ def _step(
     point = state.coordinates
     vector = space.vector(point[:-1])
     picture = passes.picture(vector, state.iteration)
-    value, change, gradient = None, np.zeros(len(point)), np.zeros(len(point))
+    value, change, gradient, normal = None, np.zeros(len(point)), np.zeros(len(point)), state.curvature
     if picture.finite:
         cleaned = clean(picture)
         if settings.noise == "match":
@@ -344,12 +237,15 @@ def _step(
         if value.finite and isinstance(passes, RecycledPasses) and settings.steps == "model":
             jacobian = cleaned.derivatives(passes.jacobian)
             trust = settings.trust * state.rate / settings.rate
-            change = model_step(cleaned.image, jacobian, point, space, loss, trust, settings.gain)
+            change, normal = model_step(cleaned.image, jacobian, point, space, loss, trust, settings.gain)
         elif value.finite:
             by_vector = passes.gradient(cleaned.transposed(value.adjoint))
-            gradient = gradient_by_point(value, by_vector, space, point, settings.gain)
+            gradient = gradient_by_point(value, by_vector, space, point, loss, settings.gain)
     good = value is not None and value.finite and bool(np.isfinite(gradient).all() and np.isfinite(change).all())
-    row = [value.total, *(value.terms[k] for k in ("texture", "color", "prior"))] if good and value else [np.nan] * 4
+    row = [np.nan] * 4
+    if good and value:
+        total = value.total + anchor_loss(point, space, loss)
+        row = [total, *(value.terms[k] for k in ("texture", "color", "prior"))]
     done = replace(
         state,
         iteration=state.iteration + 1,
@@ -373,7 +269,9 @@ def _step(
         # Bias correction counts the steps since the moments were zero, which a failure makes them.
         steps = 1 + len(state.losses) - _after_failure(state.losses)
         change, first, second = adam_step(gradient, first, second, steps, state.rate)
-    return replace(done, failures=0, coordinates=point + change, first=first, second=second, best=point.copy())
+    return replace(
+        done, failures=0, coordinates=point + change, first=first, second=second, best=point.copy(), curvature=normal
+    )
 
 
 def _after_failure(losses: Floats) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from usdfab.fit.path_loss import GAIN_DEVIATION, LossValue, PathLoss
+from usdfab.fit.path_loss import ANCHOR_DEVIATION, GAIN_DEVIATION, LossValue, PathLoss
 from usdfab.fit.path_space import OpticsSpace
 
 Floats = NDArray[np.float64]
@@ -36,21 +36,35 @@ def adam_step(
     return -rate * mean / (np.sqrt(square) + EPSILON), first, second
 
 
-def gradient_by_point(value: LossValue, by_vector: Floats, space: OpticsSpace, point: Floats, gain: bool) -> Floats:
+def gradient_by_point(
+    value: LossValue, by_vector: Floats, space: OpticsSpace, point: Floats, loss: PathLoss, gain: bool
+) -> Floats:
     """(N + 1,) from a loss and its derivatives (P,) through the picture; that by the gain is 0 where it is fixed."""
     total = by_vector.copy()
     total[-8:-2] += value.roughness.ravel()
-    return np.append(space.slope(point[:-1]) * total[space.free], value.log_gain if gain else 0.0)
+    by_coordinate = space.slope(point[:-1]) * total[space.free] + anchor_slope(point, space, loss)
+    return np.append(by_coordinate, value.log_gain if gain else 0.0)
+
+
+def anchor_loss(point: Floats, space: OpticsSpace, loss: PathLoss) -> float:
+    """The weighted anchor, 0 at the start."""
+    return 0.5 * float(np.vdot(anchor_slope(point, space, loss), point[:-1] - space.coordinates(space.start)))
+
+
+def anchor_slope(point: Floats, space: OpticsSpace, loss: PathLoss) -> Floats:
+    """(N,) its derivatives by the coordinates."""
+    return loss.weights.anchor / ANCHOR_DEVIATION**2 * (point[:-1] - space.coordinates(space.start))
 
 
 def model_step(
     image: Floats, jacobian: Floats, point: Floats, space: OpticsSpace, loss: PathLoss, trust: float, gain: bool
-) -> Floats:
+) -> tuple[Floats, Floats]:
     """What to add to ``point`` (N + 1,) to come to the least loss, at most ``trust`` in each coordinate.
 
     Statistics are taken to be linear in the coordinates; their derivatives are differences of the statistics of
     pictures ``image`` (H, W, 3) with a little of each derivative ``jacobian`` (P, H, W, 3) added. The sum of absolute
-    values is minimised by squares that are reweighted ``ROUNDS`` times.
+    values is minimised by squares that are reweighted ``ROUNDS`` times. Also returns the curvature (N + 1, N + 1) of
+    the loss, by which it rises around its least value.
     """
     moves = [*(jacobian[space.free] * space.slope(point[:-1])[:, None, None, None]), *([image] if gain else [])]
     count = len(moves)
@@ -70,7 +84,9 @@ def model_step(
         # What the statistics hardly depend on stays where it is.
         normal = normal + np.diag(DAMPING * (np.diag(normal) + np.diag(normal).mean()) + 1e-12)
         change = np.clip(change - np.linalg.solve(normal, slope), -trust, trust)
-    return change if gain else np.append(change, 0.0)
+    if gain:
+        return change, normal
+    return np.append(change, 0.0), np.pad(normal, (0, 1))
 
 
 def _prior(point: Floats, space: OpticsSpace, loss: PathLoss, gain: bool) -> tuple[Floats, Floats]:
@@ -80,7 +96,10 @@ def _prior(point: Floats, space: OpticsSpace, loss: PathLoss, gain: bool) -> tup
     curvature[-8:-2] = loss.prior_curvature()
     gradient = np.zeros(len(space.start))
     gradient[-8:-2] = loss.prior_slope(space.vector(point[:-1])[-8:-2].reshape(2, 3)).ravel()
-    result = slopes * gradient[space.free], slopes**2 * curvature[space.free]
+    result = (
+        slopes * gradient[space.free] + anchor_slope(point, space, loss),
+        slopes**2 * curvature[space.free] + loss.weights.anchor / ANCHOR_DEVIATION**2,
+    )
     if not gain:
         return result
     stiff = loss.weights.prior / GAIN_DEVIATION**2
