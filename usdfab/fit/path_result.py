@@ -93,12 +93,17 @@ def chosen_point(state: State) -> tuple[Floats, float]:
 def uncertainty_of(curvature: Floats, point: Floats, loss: float, space: OpticsSpace) -> Floats:
     """(P,) see ``PathResult.uncertainty``."""
     result = np.zeros(len(space.start))
-    result[space.free] = np.nan
+    half = 0.5 * (space.high - space.low)
     used = np.flatnonzero(np.diag(curvature) > 0.0)
-    if len(used):
-        inverse = np.linalg.inv(curvature[np.ix_(used, used)])
-        reach = np.sqrt(2.0 * RISE * loss * np.diag(inverse))[: space.size]
-        result[space.free] = np.minimum(space.slope(point[:-1]) * reach, 0.5 * (space.high - space.low))
+    result[space.free] = half if len(used) else np.nan
+    if len(used) == 0:
+        return result
+    part = curvature[np.ix_(used, used)]
+    # The ridge is for what the picture does not show at all.
+    inverse = np.linalg.inv(part + 1e-9 * part.diagonal().max() * np.eye(len(used)))
+    reach = np.sqrt(2.0 * RISE * loss * np.diag(inverse))
+    known = used[used < space.size]
+    result[space.free[known]] = np.minimum(space.slope(point[:-1])[known] * reach[: len(known)], half[known])
     return result
 
 

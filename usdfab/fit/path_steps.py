@@ -64,29 +64,30 @@ def model_step(
     Statistics are taken to be linear in the coordinates; their derivatives are differences of the statistics of
     pictures ``image`` (H, W, 3) with a little of each derivative ``jacobian`` (P, H, W, 3) added. The sum of absolute
     values is minimised by squares that are reweighted ``ROUNDS`` times. Also returns the curvature (N + 1, N + 1) of
-    the loss, by which it rises around its least value.
+    the texture and colour losses, by which they rise around their least value.
     """
     moves = [*(jacobian[space.free] * space.slope(point[:-1])[:, None, None, None]), *([image] if gain else [])]
     count = len(moves)
     residuals = loss.residuals(np.stack([image, *(image + DIFFERENCE * move for move in moves)]), float(point[-1]))
     rows = [((r[1:] - r[0]) / DIFFERENCE, r[0], weight) for r, weight in residuals]
     fixed_slope, fixed_curvature = _prior(point, space, loss, gain)
-    change = np.zeros(count)
+    change, seen = np.zeros(count), np.zeros((count, count))
     for _ in range(ROUNDS):
-        normal, slope = np.diag(fixed_curvature), fixed_slope + fixed_curvature * change
+        seen, slope = np.zeros((count, count)), fixed_slope + fixed_curvature * change
         step = rows[0][0].new_tensor(change)
         for by_point, at, weight in rows:
             now = at + step @ by_point
             size = now.abs()
             weighted = by_point * (weight / size.clamp(min=max(FLOOR * float(size.mean()), 1e-12)))
-            normal = normal + (weighted @ by_point.T).double().numpy()
+            seen = seen + (weighted @ by_point.T).double().numpy()
             slope = slope + (weighted @ now).double().numpy()
+        normal = seen + np.diag(fixed_curvature)
         # What the statistics hardly depend on stays where it is.
         normal = normal + np.diag(DAMPING * (np.diag(normal) + np.diag(normal).mean()) + 1e-12)
         change = np.clip(change - np.linalg.solve(normal, slope), -trust, trust)
     if gain:
-        return change, normal
-    return np.append(change, 0.0), np.pad(normal, (0, 1))
+        return change, seen
+    return np.append(change, 0.0), np.pad(seen, (0, 1))
 
 
 def _prior(point: Floats, space: OpticsSpace, loss: PathLoss, gain: bool) -> tuple[Floats, Floats]:
