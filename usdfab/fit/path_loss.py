@@ -35,7 +35,7 @@ class Weights:
     texture: float = 1.0
     color: float = 1.0
     prior: float = 0.02
-    anchor: float = 0.02
+    anchor: float = 0.002
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 MEMORY = 0.9
 """What a pass counts in the next iteration where optics stand still: the noise is that of nineteen passes."""
 
-STRIDE = 0.03
+STRIDE = 0.3
 """Relative change of an optical parameter that halves what earlier passes count: derivatives reach only so far."""
 
 
