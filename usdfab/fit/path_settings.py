@@ -130,7 +130,7 @@ QUALITIES: dict[Quality, PathSettings] = {
     "standard": PathSettings(side=128, iterations=40, spp=24, gradient_spp=12),
     "paper": PathSettings(side=720, iterations=50, spp=1024, gradient_spp=256, passes="separate", steps="adam"),
 }
-"""About 90 and 600 CPU seconds: 20 for a million paths of 0.4 mm yarns, and 1.6 or 3 for the statistics of each step."""
+"""Draft and standard take about 90 and 600 CPU seconds: 20 for a million paths, 1.6 and 3 for each step's sums."""
 
 
 def settings_for(quality: Quality = "standard", **changes: object) -> PathSettings:
