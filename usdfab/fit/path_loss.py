@@ -21,15 +21,15 @@ GAIN_DEVIATION = 0.1
 
 
 ANCHOR_DEVIATION = 0.5
-"""Of the coordinates of ``OpticsSpace`` from those of the start: 0.12 for an albedo of 0.5."""
+"""Of the coordinates of ``OpticsSpace`` from those of the start: an eighth of the range, in its middle."""
 
 
 @dataclass(frozen=True)
 class Weights:
     """How much the parts of the loss count.
 
-    ``anchor`` is half the square of how far the coordinates are from the start, in ``ANCHOR_DEVIATION``: what the
-    picture hardly shows stays where earlier stages have seen it.
+    ``anchor`` is half the square of how far the roughnesses' coordinates are from the start, in ``ANCHOR_DEVIATION``:
+    what the picture hardly shows stays where earlier stages have seen it.
     """
 
     texture: float = 1.0

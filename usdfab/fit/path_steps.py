@@ -23,7 +23,9 @@ FLOOR = 0.1
 """Residuals below this part of the mean of their statistic count as squares, others as absolute values."""
 
 DAMPING = 1e-3
-"""Added to the diagonal of the normal equations, relative to it (Marquardt) and to its mean."""
+"""Added to the diagonal of the normal equations, relative to it (Marquardt) and to ``FAINT`` of its mean."""
+
+FAINT = 1e-2
 
 
 def adam_step(
@@ -53,7 +55,13 @@ def anchor_loss(point: Floats, space: OpticsSpace, loss: PathLoss) -> float:
 
 def anchor_slope(point: Floats, space: OpticsSpace, loss: PathLoss) -> Floats:
     """(N,) its derivatives by the coordinates."""
-    return loss.weights.anchor / ANCHOR_DEVIATION**2 * (point[:-1] - space.coordinates(space.start))
+    return _anchor_curvature(space, loss) * (point[:-1] - space.coordinates(space.start))
+
+
+def _anchor_curvature(space: OpticsSpace, loss: PathLoss) -> Floats:
+    """(N,) 0 for albedos: each picture shows them, and those near 1 by a small part of their coordinate."""
+    rough = space.free >= len(space.start) - 8
+    return np.where(rough, loss.weights.anchor / ANCHOR_DEVIATION**2, 0.0)
 
 
 def model_step(
@@ -83,7 +91,7 @@ def model_step(
             slope = slope + (weighted @ now).double().numpy()
         normal = seen + np.diag(fixed_curvature)
         # What the statistics hardly depend on stays where it is.
-        normal = normal + np.diag(DAMPING * (np.diag(normal) + np.diag(normal).mean()) + 1e-12)
+        normal = normal + np.diag(DAMPING * (np.diag(normal) + FAINT * np.diag(normal).mean()) + 1e-12)
         change = np.clip(change - np.linalg.solve(normal, slope), -trust, trust)
     if gain:
         return change, seen
@@ -99,7 +107,7 @@ def _prior(point: Floats, space: OpticsSpace, loss: PathLoss, gain: bool) -> tup
     gradient[-8:-2] = loss.prior_slope(space.vector(point[:-1])[-8:-2].reshape(2, 3)).ravel()
     result = (
         slopes * gradient[space.free] + anchor_slope(point, space, loss),
-        slopes**2 * curvature[space.free] + loss.weights.anchor / ANCHOR_DEVIATION**2,
+        slopes**2 * curvature[space.free] + _anchor_curvature(space, loss),
     )
     if not gain:
         return result
