@@ -173,9 +173,54 @@ def test_taps_that_are_not_there() -> None:
     refused(lambda: load_features(taps=()), "nothing")
 
 
-def test_vgg19_is_never_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    refused(lambda: load_features("vgg19"), "nothing is downloaded", "torchvision")
-    (tmp_path / "checkpoints").mkdir()
-    (tmp_path / "checkpoints" / weights_file.TORCHVISION_FILE).write_bytes(b"half a file")
-    refused(lambda: load_features("vgg19"), "checksum", "fetch it again")
+def torchvision_state() -> dict[str, np.ndarray]:
+    """``tensors`` as torchvision numbers them: convolution, ReLU, convolution, ReLU, pooling, convolution."""
+    places = {"conv1_1": 0, "conv1_2": 2, "conv2_1": 5}
+    return {f"features.{places[k.split('.')[0]]}.{k.split('.')[1]}": v for k, v in tensors().items()}
+
+
+def test_a_file_with_torchvisions_keys(tmp_path: Path) -> None:
+    path = tmp_path / "vgg.safetensors"
+    save_file(torchvision_state() | {"classifier.0.bias": np.zeros(3)}, path)
+    net = load_features(path, dtype=torch.float64)
+    assert net.taps == ("conv1_1", "conv2_1")
+    image = picture(6, 12, 12)
+    mean, deviation = (np.array(v)[:, None, None] for v in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)))
+    weights = tensors()
+    layer = {n: (weights[f"{n}.weight"], weights[f"{n}.bias"]) for n in ("conv1_1", "conv1_2", "conv2_1")}
+    first = convolved((linear_to_srgb(image[0].numpy()) - mean) / deviation, *layer["conv1_1"])
+    last = convolved(pooled(convolved(first, *layer["conv1_2"]), "average"), *layer["conv2_1"])
+    found = net(image)
+    np.testing.assert_allclose(found[0][0].numpy(), first, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(found[1][0].numpy(), last, rtol=1e-10, atol=1e-10)
+
+
+def test_torchvisions_keys_of_other_networks(tmp_path: Path) -> None:
+    path, good = tmp_path / "vgg.safetensors", torchvision_state()
+    gap = {k.replace(".5.", ".6."): v for k, v in good.items()}
+    for words, state in {
+        "'features.1.running_mean' belongs": good | {"features.1.running_mean": np.zeros(4)},
+        "missing before features.6": gap,
+        "missing before features.2": {k: v for k, v in good.items() if ".0." not in k},
+        "conv2_1 has no bias": {k: v for k, v in good.items() if k != "features.5.bias"},
+        "conv1_2 has the shapes": good | {"features.2.weight": np.zeros((4, 5, 3, 3))},
+    }.items():
+        save_file(state, path)
+        refused(lambda: load_features(path), "vgg.safetensors", words)
+
+
+def test_vgg19_is_never_downloaded_and_pickle_never_read(tmp_path: Path) -> None:
+    refused(
+        lambda: load_features("vgg19"), "nothing is downloaded", "safetensors.torch import save_file", "torchvision"
+    )
+    path = tmp_path / "vgg19.pth"
+    torch.save({k: torch.from_numpy(v) for k, v in torchvision_state().items()}, path)
+    refused(lambda: load_features(path), "vgg19.pth", "no whole safetensors file")
+
+
+def test_the_conversion_command_is_python_and_writes_such_keys() -> None:
+    code = weights_file.CONVERSION.removeprefix('python -c "').removesuffix('"')
+    compile(code, "command", "exec")
+    # What the command asks of torchvision's `features`, a Sequential.
+    keys = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3), torch.nn.ReLU()).state_dict(prefix="features.")
+    assert sorted(keys) == ["features.0.bias", "features.0.weight"] and "state_dict(prefix='features.')" in code

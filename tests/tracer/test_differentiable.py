@@ -65,6 +65,15 @@ def test_the_picture_is_the_tracers_for_these_optics(tracer):
     assert abs(tracer.render(tracer.optics, 3, 5) - image).max() > 0.01
 
 
+def test_guides_are_the_tracers_layers(tracer):
+    scene, camera = swatch(tracer.fabric)
+    render = Tracer(scene).render(camera, RenderSettings((SIDE, SIDE), spp=8, max_depth=1, seed=2))
+    albedo, normal = tracer.guides(8, 2)
+    np.testing.assert_array_equal(albedo, render.albedo)
+    np.testing.assert_array_equal(normal, render.normal)
+    assert albedo.shape == normal.shape == (SIDE, SIDE, 3) and albedo.max() > 0.1
+
+
 def test_exposure_and_blocks(tracer):
     scene, camera = swatch(tracer.fabric)
     brighter = DifferentiableTracer(scene, replace(camera, exposure=1.0), (SIDE, SIDE), max_depth=4)

@@ -5,42 +5,76 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from usdfab.cli.options import Json, print_json, progress_bar
+from usdfab.cli.options import Json, Seed, print_json, progress_bar
+from usdfab.errors import UsdfabError
 
 
 def run(
-    what: Literal["photos", "losses"],
-    folder: Path,
+    what: Literal["photos", "losses", "path"],
+    folder: Path | None = None,
     /,
     *,
     features: str = "vgg16",
     fast: bool = False,
+    count: int = 1,
+    seed: Seed = 0,
+    quality: Literal["draft", "standard", "paper"] = "draft",
     json: Json = False,
 ) -> None:
-    """Judge usdfab's estimates on labelled photos, or the losses of the fit on any photos, and print a table.
+    """Judge usdfab's estimates on labelled photos or random fabrics, or the losses of the fit, and print a table.
 
     Usage examples:
 
         usdfab evaluate photos FOLDER
         usdfab evaluate losses FOLDER
+        usdfab evaluate path --count 3 --seed 1
 
     Parameters
     ----------
     what:
         photos: the analysis stage on real cloth. losses: which texture statistics tell fabrics apart (needs the fit
-        extra).
+        extra). path: how well path tracing recovers the optics of random fabrics from 20 % off (slow: a fit for each;
+        needs the fit extra).
     folder:
-        Holds the photos. For photos also SOURCES.csv with the columns file, weave and notes ("about N yarns across
-        horizontally and M vertically"); for losses two or more PNG files.
+        Of photos and losses: holds the photos. For photos also SOURCES.csv with the columns file, weave and notes
+        ("about N yarns across horizontally and M vertically"); for losses two or more PNG files.
     features:
-        Of losses: the feature network, vgg16, vgg19 or a safetensors file.
+        Of losses: the feature network, vgg16 or a safetensors file of another VGG.
     fast:
         Of losses: compute as the fit does, in bfloat16 where the processor has it.
+    count:
+        Of path: how many fabrics; plain, twill and satin in turn.
+    quality:
+        Of path: resolution, samples and iterations, as of ``usdfab fit``.
     """
+    if what == "path":
+        if folder is not None:
+            raise UsdfabError("evaluate path makes its own fabrics", place=str(folder), remedy="leave the folder out")
+        _path(count, seed, quality, json)
+        return
+    if folder is None:
+        raise UsdfabError(f"evaluate {what} needs a folder of photos", remedy=f"usdfab evaluate {what} FOLDER")
     if what == "losses":
         _losses(folder, features, fast, json)
     else:
         _photos(folder, json)
+
+
+def _path(count: int, seed: int, quality: Literal["draft", "standard", "paper"], json: bool) -> None:
+    from usdfab.fit.extra import require_fit_extra
+
+    require_fit_extra("evaluate path")
+    from usdfab.fit.path_evaluation import PHOTO_SAMPLES, evaluate_path, format_recoveries
+    from usdfab.fit.path_settings import settings_for
+
+    # The light is known here, as it is in the paper's experiment.
+    settings = settings_for(quality, gain=False)
+    with progress_bar("Path stage") as update:
+        results = evaluate_path(count, seed, settings, PHOTO_SAMPLES[quality], update)
+    if json:
+        print_json({"recoveries": [r.summary() for r in results]})
+    else:
+        print(format_recoveries(results))
 
 
 def _losses(folder: Path, features: str, fast: bool, json: bool) -> None:

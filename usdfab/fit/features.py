@@ -92,8 +92,8 @@ def load_features(
     Parameters
     ----------
     name_or_path:
-        ``vgg16`` ships with usdfab, to conv4_1. ``vgg19`` is the one of the paper, in torchvision's training, where
-        torch.hub has it in its cache. A path names a safetensors file, see :func:`read_convolutions`.
+        ``vgg16`` ships with usdfab, to conv4_1. A path names a safetensors file, see :func:`read_convolutions`: the
+        VGG-19 of the paper, for one, which ``weights_file.CONVERSION`` writes in torchvision's training.
     dtype:
         Of the convolutions; see :func:`fast_dtype`. float64 is for checks.
     taps:

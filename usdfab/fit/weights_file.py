@@ -1,4 +1,4 @@
-"""Pretrained VGG convolutions from files: the VGG-16 that ships with usdfab, a user's file, torchvision's VGG-19."""
+"""Pretrained VGG convolutions from safetensors files: the VGG-16 that ships with usdfab, or a user's (VGG-19)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as load_safetensors
 from torch import Tensor
@@ -20,13 +19,20 @@ SHIPPED_SHA256 = "457417af17ba46527f3e36f50da37516d0e564468f5ececa11b572c2826974
 CAFFE_MEAN = (123.68, 116.779, 103.939)
 """Red, green, blue of 0 to 255 that the networks of Simonyan and Zisserman 2014 subtract; they take B, G, R."""
 
-TORCHVISION_FILE, TORCHVISION_SHA256 = "vgg19-dcbb9e9d.pth", "dcbb9e9d"
-"""torchvision's VGG-19 in torch.hub's cache, and how the checksum of its contents begins."""
+CONVERSION = (
+    'python -c "from safetensors.torch import save_file; from torchvision.models import vgg19; '
+    "save_file(vgg19(weights='DEFAULT').features.state_dict(prefix='features.'), 'vgg19.safetensors')\""
+)
+"""Command that writes torchvision's VGG-19 as a file that ``read_convolutions`` takes; it downloads 0.5 GB."""
 
-VGG19_CONVOLUTIONS = (2, 2, 4, 4, 4)
-"""Convolutions in each block."""
+TORCHVISION_MEAN, TORCHVISION_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Red, green, blue of 0 to 1 by which torchvision's networks were trained."""
+
+LAST = "conv4_1"
+"""Where torchvision's networks are cut: deeper layers see more than a texture's repeat."""
 
 _KEY = re.compile(r"conv([1-9])_([1-9])\.(weight|bias)")
+_TORCHVISION_KEY = re.compile(r"features\.([0-9]{1,3})\.(weight|bias)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,41 +54,86 @@ class Convolutions:
 
 
 def read_convolutions(name_or_path: str | Path) -> Convolutions:
-    """Weights by name (``vgg16``, which ships with usdfab, or ``vgg19``) or from a safetensors file.
+    """Weights by name (``vgg16``, which ships with usdfab) or from a safetensors file.
 
     A file has keys ``convB_C.weight`` (O, I, 3, 3) and ``convB_C.bias`` from conv1_1 on without gaps, for B, G, R of 0
-    to 255 less the mean of Simonyan and Zisserman 2014.
+    to 255 less the mean of Simonyan and Zisserman 2014; or torchvision's ``features.N.weight``, see
+    :func:`torchvision_convolutions`. Files that are unpacked by running code (pickle) are not read.
 
     Raises
     ------
     UsdfabError
-        If the file is missing, corrupt or not such a network, or torchvision's VGG-19 is not on this machine (nothing
-        is downloaded).
+        If the file is missing, corrupt or not such a network; for ``vgg19``, with the command that makes its file.
     """
     if str(name_or_path) == "vgg16":
         return _caffe(_checked_safetensors(_checked_bytes(SHIPPED, SHIPPED_SHA256), SHIPPED), SHIPPED)
     if str(name_or_path) == "vgg19":
-        return _cached_vgg19()
+        raise UsdfabError(
+            "VGG-19 does not ship with usdfab, and nothing is downloaded unasked",
+            remedy=f"with torchvision installed run {CONVERSION} and name vgg19.safetensors",
+        )
     path = Path(name_or_path)
     if not path.is_file():
-        raise UsdfabError("no such file", place=str(path), remedy="name vgg16, vgg19 or a safetensors file")
-    return _caffe(_checked_safetensors(_read(path), path), path)
+        raise UsdfabError("no such file", place=str(path), remedy="name vgg16 or a safetensors file")
+    tensors = _checked_safetensors(_read(path), path)
+    if any(_TORCHVISION_KEY.fullmatch(key) for key in tensors):
+        return torchvision_convolutions(tensors, path)
+    return _caffe(tensors, path)
 
 
-def torchvision_convolutions(state: dict[str, Tensor]) -> Convolutions:
-    """The convolutions to conv4_1 from the state of ``torchvision.models.vgg19`` (keys ``features.N.weight``)."""
-    layers, position = {}, 0
-    for block, count in enumerate(VGG19_CONVOLUTIONS[:4], start=1):
-        for index in range(1, (count if block < 4 else 1) + 1):
-            layers[f"conv{block}_{index}"] = (state[f"features.{position}.weight"], state[f"features.{position}.bias"])
-            position += 2  # the ReLU
-        position += 1  # the pooling
-    deviation = (0.229, 0.224, 0.225)
-    red, green, blue = (1.0 / (255.0 * d) for d in deviation)
-    return Convolutions(layers, (0.485 * 255.0, 0.456 * 255.0, 0.406 * 255.0), (red, green, blue))
+def torchvision_convolutions(state: dict[str, Tensor], path: str | Path = "torchvision") -> Convolutions:
+    """The convolutions to conv4_1 from the state of ``torchvision.models.vgg19`` or its relatives without batch norm.
+
+    Parameters
+    ----------
+    state:
+        Keys ``features.N.weight`` and ``features.N.bias``, where N counts convolutions, ReLUs and poolings; those of
+        ``classifier`` do not matter.
+    path:
+        For messages.
+
+    Raises
+    ------
+    UsdfabError
+        For keys and shapes of other networks.
+    """
+    parts: dict[int, dict[str, Tensor]] = {}
+    for key, tensor in state.items():
+        match = _TORCHVISION_KEY.fullmatch(key)
+        if match:
+            parts.setdefault(int(match[1]), {})[match[2]] = tensor
+        elif not key.startswith("classifier."):
+            raise UsdfabError(f"'{key}' belongs to no VGG network of torchvision's", place=str(path))
+    named: dict[str, Tensor] = {}
+    block, index, last = 1, 0, -2
+    for position in sorted(parts):
+        # A ReLU lies between two convolutions, a pooling as well where a block ends.
+        if position - last not in (2, 3):
+            raise UsdfabError(f"a convolution is missing before features.{position}", place=str(path))
+        block, index = (block, index + 1) if position - last == 2 else (block + 1, 1)
+        named |= {f"conv{block}_{index}.{key}": tensor for key, tensor in parts[position].items()}
+        last = position
+        if f"conv{block}_{index}" == LAST:
+            break
+    red, green, blue = (255.0 * v for v in TORCHVISION_MEAN)
+    return Convolutions(
+        _checked_layers(named, Path(path)),
+        (red, green, blue),
+        (1.0 / (255.0 * TORCHVISION_DEVIATION[0]), 1.0 / (255.0 * TORCHVISION_DEVIATION[1]),
+         1.0 / (255.0 * TORCHVISION_DEVIATION[2])),
+    )  # fmt: skip
 
 
 def _caffe(tensors: dict[str, Tensor], path: Path) -> Convolutions:
+    layers = _checked_layers(tensors, path)
+    weight, bias = layers["conv1_1"]
+    layers["conv1_1"] = (weight.flip(1), bias)  # from B, G, R to R, G, B
+    return Convolutions(layers, CAFFE_MEAN, (1.0, 1.0, 1.0))
+
+
+def _checked_layers(tensors: dict[str, Tensor], path: Path) -> dict[str, tuple[Tensor, Tensor]]:
+    """Weight and bias of each layer, in order; complains of what is no VGG network."""
+
     def problem(text: str) -> UsdfabError:
         return UsdfabError(
             text, place=str(path), remedy="it needs keys convB_C.weight and convB_C.bias from conv1_1 on"
@@ -112,23 +163,7 @@ def _caffe(tensors: dict[str, Tensor], path: Path) -> Convolutions:
         layers[name] = (weight, bias)
     if not layers:
         raise problem("it holds no convolution")
-    weight, bias = layers["conv1_1"]
-    layers["conv1_1"] = (weight.flip(1), bias)  # from B, G, R to R, G, B
-    return Convolutions(layers, CAFFE_MEAN, (1.0, 1.0, 1.0))
-
-
-def _cached_vgg19() -> Convolutions:
-    path = Path(torch.hub.get_dir()) / "checkpoints" / TORCHVISION_FILE
-    if not path.is_file():
-        raise UsdfabError(
-            "torchvision's VGG-19 is not on this machine, and nothing is downloaded unasked",
-            place=str(path),
-            remedy="install torchvision and run "
-            "python -c \"from torchvision.models import vgg19; vgg19(weights='DEFAULT')\"",
-        )
-    _checked_bytes(path, TORCHVISION_SHA256)
-    # torch's own file format; only tensors are unpacked, no code can run.
-    return torchvision_convolutions(torch.load(path, map_location="cpu", weights_only=True))
+    return layers
 
 
 def _read(path: Path) -> bytes:
@@ -144,8 +179,11 @@ def _checked_bytes(path: Path, sha256: str) -> bytes:
         raise UsdfabError("the feature network's weights are missing", place=str(path), remedy="install usdfab again")
     data = _read(path)
     if not hashlib.sha256(data).hexdigest().startswith(sha256):
-        remedy = "install usdfab again" if path == SHIPPED else "delete it and fetch it again"
-        raise UsdfabError("the feature network's weights are damaged (wrong checksum)", place=str(path), remedy=remedy)
+        raise UsdfabError(
+            "the feature network's weights are damaged (wrong checksum)",
+            place=str(path),
+            remedy="install usdfab again",
+        )
     return data
 
 

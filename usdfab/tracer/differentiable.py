@@ -28,7 +28,7 @@ from usdfab.tracer.film import CHANNELS, RGB
 from usdfab.tracer.gradient_kernel import gradient_tile
 from usdfab.tracer.kernel import render_tile
 from usdfab.tracer.patch_scene import PatchScene, fiber_parameters, pack_material
-from usdfab.tracer.render import Tracer, pack_view, thread_count
+from usdfab.tracer.render import RenderSettings, Tracer, pack_view, thread_count
 from usdfab.tracer.schedule import Window, plan_tiles
 from usdfab.tracer.tape import SHARED, tape_size
 from usdfab.tracer.world import World
@@ -97,6 +97,7 @@ class DifferentiableTracer:
         self.fabric = scene.fabrics[fabric].fabric
         self.optics = optics_of(self.fabric)
         self._threads = thread_count(threads)
+        self._camera = camera
         self._tracer = Tracer(scene)
         self.warnings = self._tracer.warnings
         close = camera.to_world_close
@@ -222,6 +223,12 @@ class DifferentiableTracer:
                 result[3 * k + channel, ..., channel] = jacobian[..., k, channel]
         result[3 * colors :] = _shared_order(np.moveaxis(jacobian[..., colors:, :], 2, 0))
         return image, result
+
+    def guides(self, spp: int = 16, seed: int = 0) -> tuple[Floats, Floats]:
+        """Albedo and normal (H, W, 3) of what is seen first, of the fabric itself: what the denoiser is guided by."""
+        settings = RenderSettings(self.size, spp=spp, max_depth=1, seed=seed, threads=self._threads)
+        render = self._tracer.render(self._camera, settings)
+        return render.albedo.astype(np.float64), render.normal.astype(np.float64)
 
     def _layout(self, optics: Optics | ArrayLike) -> Optics:
         if not isinstance(optics, Optics):
