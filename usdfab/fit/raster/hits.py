@@ -62,9 +62,7 @@ class Gatherer:
             torch.where(torch.from_numpy(self.model.system[segment] == 0), radius[0], radius[1]),
         )
 
-    def beside(
-        self, seen: Seen, start: NDArray[np.float64], direction: Tensor, rows: NDArray[np.int64]
-    ) -> Segments:
+    def beside(self, seen: Seen, start: NDArray[np.float64], direction: Tensor, rows: NDArray[np.int64]) -> Segments:
         """The segments of the fibers that the rays ``rows`` saw which lie nearest to other rays, from ``start``.
 
         From the segment that was seen, along the fiber, ``STEPS`` segments at most: where along a fiber one segment

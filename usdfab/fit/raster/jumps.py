@@ -37,9 +37,7 @@ def jumps(gather: Gatherer, seen: Seen, p: Ints, q: Ints) -> Bools:
     return ~same
 
 
-def visible_edges(
-    gather: Gatherer, seen: Seen, rays: Rays, pairs: Pairs, along_row: bool
-) -> list[Jumps]:
+def visible_edges(gather: Gatherer, seen: Seen, rays: Rays, pairs: Pairs, along_row: bool) -> list[Jumps]:
     """Where between pixels one fiber gives way to another, for ``edges.blended``.
 
     Either the nearer fiber ends, at its silhouette |h| = 1, or two fibers run into each other. Both are one: a fiber
