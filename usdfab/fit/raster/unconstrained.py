@@ -111,7 +111,7 @@ class Parameters:
         )
 
     def fabric_of(self, natural: Tensor) -> FabricParameters:
-        """The fabric with these numbers, (P,) in their units; k_d and exposure, which it does not have, are left out."""
+        """The fabric with these numbers, (P,) in their units; it has no k_d and no exposure."""
         shapes, look = self.of(natural.detach())
         changed = {
             system: replace(self.fabric.system(system), **{n: float(getattr(shape, n)) for n in SHAPE_NAMES})
