@@ -50,9 +50,7 @@ def shown(fabric: FabricParameters, diffuse: float, width: int = 48) -> np.ndarr
         return renderer.image(renderer.model.shapes(), renderer.look_of(diffuse)).numpy()
 
 
-@pytest.mark.parametrize(
-    ("name", "wrong"), [("flattening", 1.9), ("radius", 1.7e-4), ("crimp", 1.3)]
-)
+@pytest.mark.parametrize(("name", "wrong"), [("flattening", 1.9), ("radius", 1.7e-4), ("crimp", 1.3)])
 def test_a_wrong_shape_comes_back(net: FeatureNet, name: str, wrong: float) -> None:
     # The target has other random draws, so only statistics can tell.
     target = shown(replace(CLOTH, seed=8), 0.25)

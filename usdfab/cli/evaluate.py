@@ -5,42 +5,85 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from usdfab.cli.options import Json, print_json, progress_bar
+from usdfab.cli.options import Json, Seed, print_json, progress_bar
+from usdfab.errors import UsdfabError
 
 
 def run(
-    what: Literal["photos", "losses"],
-    folder: Path,
+    what: Literal["photos", "losses", "raster"],
+    folder: Path | None = None,
     /,
     *,
     features: str = "vgg16",
     fast: bool = False,
+    count: int = 1,
+    seed: Seed = 0,
+    quality: Literal["draft", "standard", "paper"] = "draft",
+    ablation: bool = False,
+    fibers: int | None = None,
     json: Json = False,
 ) -> None:
-    """Judge usdfab's estimates on labelled photos, or the losses of the fit on any photos, and print a table.
+    """Judge usdfab's estimates on labelled photos or random fabrics, or the losses of the fit, and print a table.
 
     Usage examples:
 
         usdfab evaluate photos FOLDER
         usdfab evaluate losses FOLDER
+        usdfab evaluate raster --count 1 --fibers 40
 
     Parameters
     ----------
     what:
         photos: the analysis stage on real cloth. losses: which texture statistics tell fabrics apart (needs the fit
-        extra).
+        extra). raster: how well the raster stage recovers random fabrics of each weave (slow: a fit for each; needs
+        the fit extra).
     folder:
-        Holds the photos. For photos also SOURCES.csv with the columns file, weave and notes ("about N yarns across
-        horizontally and M vertically"); for losses two or more PNG files.
+        Of photos and losses: holds the photos. For photos also SOURCES.csv with the columns file, weave and notes
+        ("about N yarns across horizontally and M vertically"); for losses two or more PNG files.
     features:
         Of losses: the feature network, vgg16, vgg19 or a safetensors file.
     fast:
         Of losses: compute as the fit does, in bfloat16 where the processor has it.
+    count:
+        Of raster: fabrics of each of the four weaves.
+    quality:
+        Of raster: resolution and iterations, as of ``usdfab fit``.
+    ablation:
+        Of raster: each fabric also without parts of the shading and of the losses (six fits for each).
+    fibers:
+        Of raster: fibers in a yarn, instead of about 200, to save time.
     """
+    if what == "raster":
+        if folder is not None:
+            raise UsdfabError("evaluate raster makes its own fabrics", place=str(folder), remedy="leave the folder out")
+        _raster(count, seed, quality, ablation, fibers, json)
+        return
+    if folder is None:
+        raise UsdfabError(f"evaluate {what} needs a folder of photos", remedy=f"usdfab evaluate {what} FOLDER")
     if what == "losses":
         _losses(folder, features, fast, json)
     else:
         _photos(folder, json)
+
+
+def _raster(count: int, seed: int, quality: str, ablation: bool, fibers: int | None, json: bool) -> None:
+    from dataclasses import asdict
+
+    from usdfab.fit.extra import require_fit_extra
+
+    require_fit_extra("evaluate raster")
+    from usdfab.fit.raster_evaluation import ABLATIONS, evaluate_raster, format_recoveries
+    from usdfab.fit.raster_stage import checked_quality
+
+    ways = tuple(ABLATIONS) if ablation else ("full",)
+    with progress_bar("Raster stage") as update:
+        results = evaluate_raster(
+            count, seed, checked_quality(quality), ablations=ways, fibers=fibers, progress=update
+        )  # fmt: skip
+    if json:
+        print_json({"recoveries": [asdict(r) for r in results]})
+    else:
+        print(format_recoveries(results))
 
 
 def _losses(folder: Path, features: str, fast: bool, json: bool) -> None:

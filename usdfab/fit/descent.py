@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -240,11 +241,8 @@ def load_state(path: Path, job: str) -> State:
                     remedy="fit without --resume to start again",
                 )
             tensors = {name: file.get_tensor(name) for name in _TENSORS}
-            numbers = json.loads(about["state"])
-            return State(
-                **tensors,
-                **{k: tuple(v) if isinstance(v, list) else v for k, v in numbers.items()},
-            )
+            numbers: dict[str, Any] = json.loads(about["state"])
+            return State(**tensors, **{k: tuple(v) if isinstance(v, list) else v for k, v in numbers.items()})
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, UsdfabError):
             raise

@@ -112,7 +112,7 @@ def fit_photo(
         warnings.insert(
             0, f"nothing says how large the photo is: its width is taken as {DEFAULT_WIDTH * 1e3:g} mm; use --size"
         )
-    outcomes = (StageOutcome("analysis", fabric, time.perf_counter() - begun),)
+    outcomes: tuple[StageOutcome, ...] = (StageOutcome("analysis", fabric, time.perf_counter() - begun),)
     if settings is not None:
         before, after = run_raster(
             fabric, shown, photo, analysis.rotation, settings, seed=seed, albedo_paths=albedo_paths,

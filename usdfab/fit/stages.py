@@ -36,7 +36,8 @@ class StageOutcome:
     """What one stage found.
 
     ``losses`` of its iterations, if it has any; ``seconds`` it took; ``distance`` of the path-traced swatch from the
-    photo by the losses of the fit, where that was measured; ``notes`` are sentences for people.
+    photo by the losses of the fit, where that was measured; ``notes`` are sentences for people; ``interrupted`` after
+    Ctrl-C.
     """
 
     name: str
@@ -45,6 +46,7 @@ class StageOutcome:
     losses: tuple[float, ...] = ()
     distance: float | None = None
     notes: tuple[str, ...] = ()
+    interrupted: bool = False
 
 
 def checked_stages(stages: Sequence[str]) -> tuple[str, ...]:
@@ -144,7 +146,7 @@ def run_raster(
     seconds = time.perf_counter() - begun
     return (
         StageOutcome("analysis", start, 0.0, distance=before),
-        StageOutcome("raster", found, seconds, result.losses, min(before, after), tuple(notes)),
+        StageOutcome("raster", found, seconds, result.losses, min(before, after), tuple(notes), result.interrupted),
     )
 
 

@@ -114,7 +114,7 @@ class Parameters:
         """The fabric with these numbers, (P,) in their units; it has no k_d and no exposure."""
         shapes, look = self.of(natural.detach())
         changed = {
-            system: replace(self.fabric.system(system), **{n: float(getattr(shape, n)) for n in SHAPE_NAMES})
+            system: replace(self.fabric.system(system), **{n: float(getattr(shape, n)) for n in SHAPE_NAMES})  # type: ignore[arg-type]
             for system, shape in zip(SYSTEMS, shapes, strict=True)
         }
         old = optics_of(self.fabric)
@@ -171,13 +171,13 @@ def parameters_of(
                 f"{name} starts at {value:g}, outside its range",
                 remedy=f"start between {low:g} and {high:g}",
             )
-    low, high, log = (torch.tensor([r[i] for r in ranges], dtype=torch.float64) for i in range(3))
+    lows, highs, logs = (torch.tensor([r[i] for r in ranges], dtype=torch.float64) for i in range(3))
     return Parameters(
         fabric,
         tuple(name for name, _, _ in rows),
-        low,
-        high,
-        log.bool(),
+        lows,
+        highs,
+        logs.bool(),
         torch.tensor([value for _, _, value in rows], dtype=torch.float64),
         torch.tensor(moving),
     )
