@@ -111,7 +111,7 @@ def test_the_map_without_bounds_and_back() -> None:
     for far in (-40.0, 40.0):
         moved = parameters.natural(torch.full_like(parameters.vector(), far))
         for name, value in zip(parameters.names, moved.tolist(), strict=True):
-            low, high = soft_range(name.split(".")[-1].split("[")[0])
+            low, high = soft_range(name.removeprefix("warp.").removeprefix("weft.").split("[")[0])
             rounding = 1e-12 * max(abs(low), 1.0)
             assert low - rounding <= value <= high + rounding, name
 
