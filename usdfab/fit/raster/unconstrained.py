@@ -36,6 +36,10 @@ LOG_SPAN = 50.0
 MARGIN = 1e-3
 """A start on the border of its range is moved inwards by this part of the range: there a sigmoid has no slope."""
 
+STEPS = {"radius": 0.2, "roughness_primary": 0.3}
+"""How far a step moves these, compared with the others. Their ranges are wide beside what a start is uncertain by: a
+full step of the radius would be 6 % at a rate of 0.05, and gamma_M0, of which a picture says little, would wander."""
+
 DIFFUSE_RANGE = (0.0, 1.0)
 """k_d: what a surface reflects diffusely."""
 
@@ -53,6 +57,8 @@ class Parameters:
     low, high: (P,) tensors
         Ranges, logarithms where ``log``; the exposure has none, (-inf, inf).
     log: (P,) bool tensor
+    step: (P,) tensor
+        Slopes of the sigmoids, relative to each other: ``STEPS``.
     start: (P,) tensor
         Natural values.
     free: (F,) int64 tensor
@@ -64,6 +70,7 @@ class Parameters:
     low: Tensor
     high: Tensor
     log: Tensor
+    step: Tensor
     start: Tensor
     free: Tensor
 
@@ -76,15 +83,15 @@ class Parameters:
         """(F,) float64: the start, without bounds; the inverse of :meth:`natural`."""
         value = torch.where(self.log, self.start.clamp(min=1e-300).log(), self.start)
         share = ((value - self.low) / (self.high - self.low)).clamp(MARGIN, 1.0 - MARGIN)
-        return torch.where(self.high.isinf(), value, torch.logit(share))[self.free]
+        return (torch.where(self.high.isinf(), value, torch.logit(share)) / self.step)[self.free]
 
     def natural(self, vector: Tensor) -> Tensor:
         """(P,) all numbers in their units, the fixed ones as at the start; differentiable in ``vector`` (F,)."""
         low, high, log = self.low[self.free], self.high[self.free], self.log[self.free]
-        unbounded = high.isinf()
+        unbounded, scaled = high.isinf(), vector * self.step[self.free]
         # No infinities in the branch that is not taken: 0 times infinity is no number.
         base, span = low.where(~unbounded, 0.0), (high - low).where(~unbounded, 0.0)
-        value = torch.where(unbounded, vector, base + span * torch.sigmoid(vector))
+        value = torch.where(unbounded, scaled, base + span * torch.sigmoid(scaled))
         # Likewise no exponential of what is no logarithm.
         value = torch.where(log, torch.where(log, value, 0.0).exp(), value)
         return self.start.index_copy(0, self.free, value)
@@ -178,6 +185,7 @@ def parameters_of(
         lows,
         highs,
         logs.bool(),
+        torch.tensor([STEPS.get(kind, 1.0) for _, kind, _ in rows], dtype=torch.float64),
         torch.tensor([value for _, _, value in rows], dtype=torch.float64),
         torch.tensor(moving),
     )
