@@ -242,7 +242,8 @@ def load_state(path: Path, job: str) -> State:
                 )
             tensors = {name: file.get_tensor(name) for name in _TENSORS}
             numbers: dict[str, Any] = json.loads(about["state"])
-            return State(**tensors, **{k: tuple(v) if isinstance(v, list) else v for k, v in numbers.items()})
+            values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in numbers.items()}
+            return State(**tensors, **values)
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, UsdfabError):
             raise
