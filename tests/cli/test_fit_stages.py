@@ -26,6 +26,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pipeline, "fit_photo", partial(pipeline.fit_photo, albedo_paths=1000))
 
 
+@pytest.mark.slow
 def test_both_stages_with_report(run: Run, quick: None, tmp_path: Path) -> None:
     out, report = tmp_path / "fabric.usda", tmp_path / "report"
     command = ("fit", PHOTO, "-o", out, "--size", "4mm", "--stages", "analysis,raster", "-q", "--json")
@@ -45,6 +46,7 @@ def test_both_stages_with_report(run: Run, quick: None, tmp_path: Path) -> None:
     assert {p.name for p in tmp_path.iterdir()} == {"fabric.usda", "report"}
 
 
+@pytest.mark.slow
 def test_a_killed_stage_leaves_its_state_and_is_resumed(
     run: Run, quick: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
