@@ -10,7 +10,7 @@ from usdfab.errors import UsdfabError
 
 
 def run(
-    what: Literal["photos", "losses", "path"],
+    what: Literal["photos", "losses", "raster", "path"],
     folder: Path | None = None,
     /,
     *,
@@ -19,6 +19,8 @@ def run(
     count: int = 1,
     seed: Seed = 0,
     quality: Literal["draft", "standard", "paper"] = "draft",
+    ablation: bool = False,
+    fibers: int | None = None,
     json: Json = False,
 ) -> None:
     """Judge usdfab's estimates on labelled photos or random fabrics, or the losses of the fit, and print a table.
@@ -27,14 +29,15 @@ def run(
 
         usdfab evaluate photos FOLDER
         usdfab evaluate losses FOLDER
+        usdfab evaluate raster --count 1 --fibers 40
         usdfab evaluate path --count 3 --seed 1
 
     Parameters
     ----------
     what:
         photos: the analysis stage on real cloth. losses: which texture statistics tell fabrics apart (needs the fit
-        extra). path: how well path tracing recovers the optics of random fabrics from 20 % off (slow: a fit for each;
-        needs the fit extra).
+        extra). raster, path: how well that stage of the fit recovers random fabrics of each weave from 20 % off (slow: a
+        fit for each; needs the fit extra).
     folder:
         Of photos and losses: holds the photos. For photos also SOURCES.csv with the columns file, weave and notes
         ("about N yarns across horizontally and M vertically"); for losses two or more PNG files.
@@ -43,14 +46,23 @@ def run(
     fast:
         Of losses: compute as the fit does, in bfloat16 where the processor has it.
     count:
-        Of path: how many fabrics; plain, twill and satin in turn.
+        Of raster: fabrics of each of the four weaves; of path: how many fabrics, plain, twill and satin in turn.
     quality:
-        Of path: resolution, samples and iterations, as of ``usdfab fit``.
+        Of raster and path: resolution, samples and iterations, as of ``usdfab fit``.
+    ablation:
+        Of raster: each fabric also without parts of the shading and of the losses (six fits for each).
+    fibers:
+        Of raster: fibers in a yarn, instead of about 200, to save time.
     """
-    if what == "path":
+    if what in ("raster", "path"):
         if folder is not None:
-            raise UsdfabError("evaluate path makes its own fabrics", place=str(folder), remedy="leave the folder out")
-        _path(count, seed, quality, json)
+            raise UsdfabError(
+                f"evaluate {what} makes its own fabrics", place=str(folder), remedy="leave the folder out"
+            )
+        if what == "raster":
+            _raster(count, seed, quality, ablation, fibers, json)
+        else:
+            _path(count, seed, quality, json)
         return
     if folder is None:
         raise UsdfabError(f"evaluate {what} needs a folder of photos", remedy=f"usdfab evaluate {what} FOLDER")
@@ -73,6 +85,24 @@ def _path(count: int, seed: int, quality: Literal["draft", "standard", "paper"],
         results = evaluate_path(count, seed, settings, PHOTO_SAMPLES[quality], update)
     if json:
         print_json({"recoveries": [r.summary() for r in results]})
+
+
+def _raster(count: int, seed: int, quality: str, ablation: bool, fibers: int | None, json: bool) -> None:
+    from dataclasses import asdict
+
+    from usdfab.fit.extra import require_fit_extra
+
+    require_fit_extra("evaluate raster")
+    from usdfab.fit.raster_evaluation import ABLATIONS, evaluate_raster, format_recoveries
+    from usdfab.fit.raster_stage import checked_quality
+
+    ways = tuple(ABLATIONS) if ablation else ("full",)
+    with progress_bar("Raster stage") as update:
+        results = evaluate_raster(
+            count, seed, checked_quality(quality), ablations=ways, fibers=fibers, progress=update
+        )  # fmt: skip
+    if json:
+        print_json({"recoveries": [asdict(r) for r in results]})
     else:
         print(format_recoveries(results))
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -20,6 +21,15 @@ def run(
     output: Output,
     size: Annotated[str | None, Parameter(help="Physical width of the picture, e.g. 3.6mm.")] = None,
     pixel_size: Annotated[str | None, Parameter(help="Physical size of a pixel, e.g. 7.5um.")] = None,
+    stages: Annotated[
+        str, Parameter(help="Comma-separated, in order: analysis, raster (slow; needs the fit extra).")
+    ] = "analysis",
+    quality: Annotated[
+        Literal["draft", "standard", "paper"], Parameter(help="Resolution and iterations of the raster stage.")
+    ] = "draft",
+    resume: Annotated[
+        bool, Parameter(negative="", help="Go on from the state that an unfinished raster stage left beside OUTPUT.")
+    ] = False,
     report: Annotated[Path | None, Parameter(help="Folder for pictures: photo, swatch, side by side.")] = None,
     report_spp: Annotated[int, Parameter(help="Samples per pixel of the report's swatch.")] = 24,
     denoise: Denoise = False,
@@ -31,12 +41,14 @@ def run(
     """Estimate a fabric from one photo of woven cloth, seen straight from above.
 
     The analysis stage reads counts, weave, colours, widths and twist from the photo; fiber parameters it cannot see
-    are priors, and what is uncertain is said.
+    are priors, and what is uncertain is said. The raster stage then moves shape and appearance until a rasterized
+    picture resembles the photo; Ctrl-C ends it early with the best so far.
 
     Usage examples:
 
         usdfab fit photo.png -o fabric.usda --size 3.6mm
         usdfab fit photo.tif -o fabric.usda --pixel-size 7.5um --report report --json
+        usdfab fit photo.png -o fabric.usda --size 3.6mm --stages analysis,raster --quality standard
 
     Parameters
     ----------
@@ -59,9 +71,24 @@ def run(
         raise UsdfabError(f"{seed} is not between 0 and 2^31 - 1", place="--seed")
     width = parse_length(size) if size else None
     pixel = parse_length(pixel_size) if pixel_size else None
+    state = output.with_name(f"{output.name}.raster.safetensors")
     with progress_bar("fitting", quiet=quiet) as update:
-        fit = fit_photo(photo, width, pixel, seed, lambda text, done, total: update(done, total, text))
+        fit = fit_photo(
+            photo,
+            width,
+            pixel,
+            seed,
+            lambda text, done, total: update(done, total, text),
+            stages=[name.strip() for name in stages.split(",")],
+            quality=quality,
+            checkpoint=state,
+            resume=resume,
+        )
     write_fabric(fit.fabric, output, overwrite=overwrite)
+    if not any(stage.interrupted for stage in fit.stages):
+        state.unlink(missing_ok=True)
+    elif not quiet:
+        say(f"the raster stage was interrupted: --resume --overwrite goes on from {state}")
     pictures: dict[str, Path] = {}
     if report is not None:
         with progress_bar("rendering the report", quiet=quiet) as update:
@@ -72,7 +99,15 @@ def run(
         for warning in fit.warnings:
             say(f"warning: {warning}")
     if json:
-        print_json({"output": output, "fabric": as_table(fit.fabric), "analysis": _analysis(fit), "pictures": pictures})
+        print_json(
+            {
+                "output": output,
+                "fabric": as_table(fit.fabric),
+                "analysis": _analysis(fit),
+                "stages": _stages(fit),
+                "pictures": pictures,
+            }
+        )
     elif not quiet:
         fabric = fit.fabric
         say(
@@ -81,6 +116,20 @@ def run(
         )
         for path in pictures.values():
             say(f"wrote {path}")
+
+
+def _stages(fit: Fit) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": stage.name,
+            "seconds": stage.seconds,
+            # JSON knows no NaN: a step taken back has no loss.
+            "losses": [loss if math.isfinite(loss) else None for loss in stage.losses],
+            "distance": stage.distance,
+            "notes": list(stage.notes),
+        }
+        for stage in fit.stages
+    ]
 
 
 def _analysis(fit: Fit) -> dict[str, Any]:

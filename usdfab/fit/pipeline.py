@@ -1,9 +1,10 @@
-"""`usdfab fit`: from a photo to a fabric. Today by the analysis stage alone; later stages start from its result."""
+"""`usdfab fit`: from a photo to a fabric, stage by stage; each starts from the result of the one before."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from usdfab.fabric.fabric import SIZE_RANGE
 from usdfab.fit.albedo import LADDER, PATHS, REFINEMENTS, brightness_curves, with_inverted_albedo
 from usdfab.fit.analysis import PhotoAnalysis, analyze_photo
 from usdfab.fit.priors import fabric_from_analysis
+from usdfab.fit.stages import StageOutcome, checked_stages, run_raster
 from usdfab.imaging import read_image
 
 DEFAULT_WIDTH = 5e-3
@@ -31,7 +33,7 @@ class Fit:
     """A fitted fabric, what the photo showed, and what is uncertain.
 
     ``photo`` is the linear picture (H, W, 3); ``size_source`` says where the physical size comes from; ``warnings``
-    are sentences for people.
+    are sentences for people; ``stages`` is what each stage found, in order.
     """
 
     fabric: FabricParameters
@@ -39,6 +41,7 @@ class Fit:
     photo: NDArray[np.float32]
     size_source: str
     warnings: tuple[str, ...]
+    stages: tuple[StageOutcome, ...] = ()
 
 
 def fit_photo(
@@ -48,6 +51,11 @@ def fit_photo(
     seed: int = 0,
     progress: Progress | None = None,
     albedo_paths: int = PATHS,
+    *,
+    stages: Sequence[str] = ("analysis",),
+    quality: str = "draft",
+    checkpoint: Path | None = None,
+    resume: bool = False,
 ) -> Fit:
     """Estimate a fabric from one photo.
 
@@ -62,26 +70,38 @@ def fit_photo(
         Fixes the fabric's random draws and those of the renders made on the way.
     albedo_paths:
         Paths in each render by which albedos are found; fewer are faster and noisier.
+    stages, quality:
+        Which of ``stages.STAGES`` run; resolution and iterations of those after the analysis: draft, standard, paper.
+    checkpoint, resume:
+        A file in which the raster stage keeps its state every few iterations, and whether to go on from it. It is left
+        there at the end.
 
     Raises
     ------
     UsdfabError
-        For a file that is no image, too small, or shows no woven cloth.
+        For a file that is no image, too small, or shows no woven cloth; for stages and qualities that there are not.
     """
     say = progress or (lambda *_: None)
+    wanted = checked_stages(stages)
+    settings = None
+    if "raster" in wanted:
+        from usdfab.fit.raster_stage import checked_quality
+
+        settings = checked_quality(quality)
+    begun = time.perf_counter()
     say("reading", 0, 8)
     image = read_image(path)
     photo = image.pixels
     width, source = _physical_width(photo.shape[1], width, pixel_size, image.pixel_size)
     say("analysing", 1, 8)
     analysis = analyze_photo(photo.astype(np.float64), str(path))
-    fabric, prior_notes = fabric_from_analysis(analysis, width, seed, _prim_name(Path(path).stem))
+    shown, prior_notes = fabric_from_analysis(analysis, width, seed, _prim_name(Path(path).stem))
     ladder, steps = len(LADDER), 2 + len(LADDER) + REFINEMENTS
     curves = brightness_curves(
-        fabric, albedo_paths, seed=seed, progress=lambda done, _: say("measuring albedo", 2 + done, steps)
+        shown, albedo_paths, seed=seed, progress=lambda done, _: say("measuring albedo", 2 + done, steps)
     )
     fabric, albedo_notes = with_inverted_albedo(
-        fabric,
+        shown,
         curves,
         albedo_paths,
         seed=seed,
@@ -92,15 +112,24 @@ def fit_photo(
         warnings.insert(
             0, f"nothing says how large the photo is: its width is taken as {DEFAULT_WIDTH * 1e3:g} mm; use --size"
         )
+    outcomes: tuple[StageOutcome, ...] = (StageOutcome("analysis", fabric, time.perf_counter() - begun),)
+    if settings is not None:
+        before, after = run_raster(
+            fabric, shown, photo, analysis.rotation, settings, seed=seed, albedo_paths=albedo_paths,
+            checkpoint=checkpoint, resume=resume, progress=say,
+        )  # fmt: skip
+        outcomes = (replace(before, seconds=outcomes[0].seconds), after)
+        fabric = after.fabric
+        warnings += after.notes
     notes = [f"size from {source}", *_confidences(analysis), *warnings, *prior_notes]
     provenance = Provenance(
         source=Path(path).name,
         source_sha256=hashlib.sha256(Path(path).read_bytes()).hexdigest(),
         generator=f"usdfab {__version__}",
-        stages=("analysis",),
+        stages=wanted,
         notes=tuple(notes),
     )
-    return Fit(replace(fabric, provenance=provenance), analysis, photo, source, tuple(warnings))
+    return Fit(replace(fabric, provenance=provenance), analysis, photo, source, tuple(warnings), outcomes)
 
 
 def _physical_width(

@@ -1,0 +1,171 @@
+"""The stages of ``usdfab fit``: their names, what each found, and the raster stage as the pipeline runs it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from usdfab.errors import UsdfabError
+from usdfab.fabric import FabricParameters
+from usdfab.fit.albedo import LADDER, PATHS, REFINEMENTS, brightness_curves, with_inverted_albedo
+from usdfab.fit.extra import require_fit_extra
+from usdfab.tracer import RenderSettings, Tracer
+from usdfab.usd.rig import swatch_scene
+
+if TYPE_CHECKING:
+    from usdfab.fit.features import FeatureNet
+    from usdfab.fit.raster_stage import StageSettings
+
+STAGES = ("analysis", "raster", "path")
+"""In the order in which they run."""
+
+JUDGE_PATHS_PER_PIXEL = 32
+"""Of the pictures by which a stage's result is judged: noise below what textures differ by at half the size."""
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class StageOutcome:
+    """What one stage found.
+
+    ``losses`` of its iterations, if it has any; ``seconds`` it took; ``distance`` of the path-traced swatch from the
+    photo by the losses of the fit, where that was measured; ``notes`` are sentences for people; ``interrupted`` after
+    Ctrl-C.
+    """
+
+    name: str
+    fabric: FabricParameters
+    seconds: float
+    losses: tuple[float, ...] = ()
+    distance: float | None = None
+    notes: tuple[str, ...] = ()
+    interrupted: bool = False
+
+
+def checked_stages(stages: Sequence[str]) -> tuple[str, ...]:
+    """Stage names in order.
+
+    Raises
+    ------
+    UsdfabError
+        For unknown names, a missing analysis, a stage that does not exist yet, and one whose packages are missing.
+    """
+    names = tuple(stages)
+    unknown = [name for name in names if name not in STAGES]
+    if unknown or len(set(names)) != len(names):
+        problem = f"there is no stage '{unknown[0]}'" if unknown else "a stage is named twice"
+        raise UsdfabError(problem, place="--stages", remedy=f"choose from {','.join(STAGES)}")
+    if "analysis" not in names:
+        raise UsdfabError("the other stages start from the analysis", place="--stages", remedy="begin with analysis")
+    if "path" in names:
+        raise UsdfabError(
+            "the path stage is not part of this version", place="--stages", remedy="use analysis or analysis,raster"
+        )
+    if "raster" in names:
+        require_fit_extra("the raster stage")
+    return tuple(name for name in STAGES if name in names)
+
+
+def run_raster(
+    start: FabricParameters,
+    shown: FabricParameters,
+    photo: NDArray,
+    rotation: float,
+    settings: StageSettings,
+    *,
+    seed: int = 0,
+    albedo_paths: int = PATHS,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> tuple[StageOutcome, StageOutcome]:
+    """Stage 2 on a photo, its colours made right under path tracing, and judged against the start.
+
+    Parameters
+    ----------
+    start:
+        What the stages before found.
+    shown:
+        The same with the colours that the photo shows as albedo, see ``albedo.with_inverted_albedo``.
+    photo, rotation:
+        (H, W, 3) linear, its whole width ``start.size[0]``; turn of the cloth in it, radians.
+    checkpoint, resume:
+        As ``raster_stage.refine_by_raster``.
+
+    Returns
+    -------
+    before, after:
+        ``after.fabric`` is the better of the two by the distance of its path-traced picture; a note says so where that
+        is the start.
+    """
+    from usdfab.fit.features import fast_dtype, load_features
+    from usdfab.fit.raster.unconstrained import within_ranges
+    from usdfab.fit.raster_stage import refine_by_raster, straightened
+
+    say = progress or (lambda *_: None)
+    begun = time.perf_counter()
+    scale = settings.width / start.size[0]
+    target = straightened(photo, rotation, photo.shape[1] / start.size[0], scale)
+    net = load_features(dtype=fast_dtype())
+    tame, outside = within_ranges(start)
+    notes = [f"{name} was outside the raster stage's range and starts at its border" for name in outside]
+    ladder, extra = len(LADDER), len(LADDER) + REFINEMENTS
+    steps = settings.iterations + extra
+    result = refine_by_raster(
+        tame, target, settings, net=net, checkpoint=checkpoint, resume=resume,
+        progress=lambda done, _, loss: say(f"raster, loss {loss:.3f}", done, steps),
+    )  # fmt: skip
+    notes += result.notes
+    if result.interrupted:
+        notes.append(f"the raster stage was interrupted after {len(result.losses)} iterations")
+    found = result.fabric
+    dyed = replace(
+        found,
+        warp=replace(found.warp, albedo=shown.warp.albedo, yarn_albedo=shown.warp.yarn_albedo),
+        weft=replace(found.weft, albedo=shown.weft.albedo, yarn_albedo=shown.weft.yarn_albedo),
+    )
+    done = settings.iterations
+    curves = brightness_curves(
+        dyed, albedo_paths, seed=seed, progress=lambda k, _: say("measuring albedo", done + k, steps)
+    )
+    found, albedo_notes = with_inverted_albedo(
+        dyed, curves, albedo_paths, seed=seed, progress=lambda k, _: say("measuring albedo", done + ladder + k, steps)
+    )
+    notes += albedo_notes
+    before, after = (traced_distance(fabric, target, settings, net, seed) for fabric in (start, found))
+    if not after < before:
+        notes.append(f"the raster stage did not come closer to the photo ({before:.3f}, then {after:.3f}): not used")
+        found = start
+    seconds = time.perf_counter() - begun
+    return (
+        StageOutcome("analysis", start, 0.0, distance=before),
+        StageOutcome("raster", found, seconds, result.losses, min(before, after), tuple(notes), result.interrupted),
+    )
+
+
+def traced_distance(
+    fabric: FabricParameters, target: NDArray, settings: StageSettings, net: FeatureNet, seed: int = 0
+) -> float:
+    """Texture and colour loss of the path-traced swatch against a target at the scale of ``settings``."""
+    import torch
+
+    from usdfab.fit.raster_stage import render_size
+    from usdfab.fit.texture import Target, color_loss, texture_loss
+
+    scene = swatch_scene(fabric)
+    size = render_size(fabric, settings.width)
+    render = Tracer(scene).render(scene.cameras[0], RenderSettings(size, spp=JUDGE_PATHS_PER_PIXEL, seed=seed))
+    with torch.no_grad():
+        goal, image = (
+            torch.from_numpy(np.ascontiguousarray(p, dtype=np.float32)).permute(2, 0, 1)
+            for p in (target, render.pixels)
+        )
+        known = Target.from_image(goal, net, settings.levels, settings.kind)
+        return float(settings.texture * texture_loss(image, known) + settings.color * color_loss(image, known))
