@@ -36,7 +36,7 @@ def run(
     ----------
     what:
         photos: the analysis stage on real cloth. losses: which texture statistics tell fabrics apart (needs the fit
-        extra). raster, path: how well that stage of the fit recovers random fabrics of each weave from 20 % off (slow: a
+        extra). raster, path: how well that stage recovers random fabrics of each weave from 20 % off (slow: a
         fit for each; needs the fit extra).
     folder:
         Of photos and losses: holds the photos. For photos also SOURCES.csv with the columns file, weave and notes
@@ -85,6 +85,8 @@ def _path(count: int, seed: int, quality: Literal["draft", "standard", "paper"],
         results = evaluate_path(count, seed, settings, PHOTO_SAMPLES[quality], update)
     if json:
         print_json({"recoveries": [r.summary() for r in results]})
+    else:
+        print(format_recoveries(results))
 
 
 def _raster(count: int, seed: int, quality: str, ablation: bool, fibers: int | None, json: bool) -> None:
