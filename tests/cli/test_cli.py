@@ -72,6 +72,7 @@ def test_help_lists_every_command_and_shows_examples() -> None:
         "check",
         "evaluate",
         "export",
+        "dataset",
     }
     assert names | {"schema"} == set(COMMANDS)
     for name in COMMANDS:
