@@ -274,10 +274,7 @@ def test_plugin_against_numba(low, tolerance):
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, mi.Vector3f(wi))
     got = np.vstack([np.array(value), np.array(pdf)[None]])
     # Mitsuba traces all plugins that exist in every later render, and takes none with a value for each lane.
-    for name in NUMBERS:
-        params[name] = mi.Float(1.5 if name == "eta" else 0.5)
-    params["albedo"] = mi.Color3f(0.5)
-    params.update()
+    params.update({"albedo": mi.Color3f(0.5), "eta": mi.Float(1.5), **{name: mi.Float(0.5) for name in NUMBERS[:3]}})
     expected = in_numba(packed_rows(values), wo.astype(float), wi.astype(float))
     seen = expected.min(axis=0) > 1e-4
     assert seen.sum() > 0.6 * n

@@ -71,7 +71,7 @@ class Gatherer:
         segment, copy = seen.segment[rows].astype(np.int64), seen.copy[rows].astype(np.int64)
         with torch.no_grad():
             for _ in range(STEPS):
-                along = _place(self.segments(segment, copy, start), direction).numpy()
+                along = _cylinder(self.segments(segment, copy, start), direction)[3].numpy()
                 on, back = along > 1.0, along < 0.0
                 if not (on | back).any():
                     break
@@ -87,22 +87,24 @@ STEPS = 2
 """Segments along a fiber that are searched for the one beside a ray."""
 
 
-def _place(s: Segments, direction: Tensor) -> Tensor:
-    """Where along the segments, in [0, 1], rays enter their cylinders, or pass them by."""
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """(..., 3) and (..., 3) to (...)."""
+    return (a * b).sum(dim=-1)
+
+
+def _cylinder(s: Segments, direction: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """As ``pass_by``, of the infinite cylinders; and where along the segments rays enter them or pass by, in [0, 1]."""
     chord = s.end - s.start
     length = torch.sqrt(dot(chord, chord) + _EPSILON)
     axis = chord / length[:, None]
     b = dot(direction, axis)
     sin2 = (1.0 - b * b).clamp_min(1e-6)
     middle = (dot(s.start, direction) - b * dot(s.start, axis)) / sin2
-    h = dot(s.start, torch.linalg.cross(direction, axis, dim=-1)) / (torch.sqrt(sin2) * s.radius)
-    entry = middle - s.radius * torch.sqrt((1.0 - h * h).clamp_min(0.0) / sin2)
-    return (b * entry - dot(s.start, axis)) / length
-
-
-def dot(a: Tensor, b: Tensor) -> Tensor:
-    """(..., 3) and (..., 3) to (...)."""
-    return (a * b).sum(dim=-1)
+    half = s.radius / torch.sqrt(sin2)
+    across = torch.linalg.cross(direction, axis, dim=-1)
+    h = dot(s.start, across) / (torch.sqrt(sin2) * s.radius)
+    entry = middle - half * torch.sqrt((1.0 - h * h).clamp_min(0.0) + _EPSILON)
+    return h, middle, half, (b * entry - dot(s.start, axis)) / length
 
 
 def pass_by(s: Segments, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -116,20 +118,9 @@ def pass_by(s: Segments, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     middle, half: (N,)
         The surface is at ``middle - half * sqrt(1 - h^2)`` along the ray.
     """
-    chord = s.end - s.start
-    length = torch.sqrt(dot(chord, chord) + _EPSILON)
-    axis = chord / length[:, None]
-    b = dot(direction, axis)
-    sin2 = (1.0 - b * b).clamp_min(1e-6)
-    middle = (dot(s.start, direction) - b * dot(s.start, axis)) / sin2
-    half = s.radius / torch.sqrt(sin2)
-    across = torch.linalg.cross(direction, axis, dim=-1)
-    h = dot(s.start, across) / (torch.sqrt(sin2) * s.radius)
-
+    h, middle, half, along = _cylinder(s, direction)
     # The two segments at a joint share its sphere, so that it does not matter which of them Embree names.
-    entry = middle - half * torch.sqrt((1.0 - h * h).clamp_min(0.0) + _EPSILON)
-    along = b * entry - dot(s.start, axis)
-    past_end = along > length
+    past_end = along > 1.0
     center = torch.where(past_end[:, None], s.end, s.start)
     nearest = dot(center, direction)
     aside = center - nearest[:, None] * direction
