@@ -15,6 +15,7 @@ from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, YarnParameters, weave_from_name
 from usdfab.fabric.optics import optics_of
 from usdfab.fit.features import FeatureNet
+from usdfab.fit.path_stage import start_from_joint
 from usdfab.fit.raster.renderer import RasterSettings, raster_renderer
 from usdfab.fit.raster.unconstrained import FREE_NAMES, parameters_of, soft_range, within_ranges
 from usdfab.fit.raster_stage import (
@@ -23,7 +24,6 @@ from usdfab.fit.raster_stage import (
     matching_diffuse,
     refine_by_raster,
     straightened,
-    traced_albedo,
 )
 from usdfab.usd.rig import swatch_scene
 
@@ -158,7 +158,9 @@ def test_diffuse_starts_at_the_targets_colour() -> None:
 def test_tracing_starts_halfway_between_albedo_and_diffuse(net: FeatureNet) -> None:
     target = shown(CLOTH, 0.3)
     found = refine_by_raster(CLOTH, target, replace(QUICK, iterations=1), net=net, diffuse=0.3)
-    assert optics_of(traced_albedo(found)).albedo == pytest.approx(0.5 * (optics_of(CLOTH).albedo + 0.3))
+    assert optics_of(start_from_joint(found.fabric, found.diffuse)).albedo == pytest.approx(
+        0.5 * (optics_of(CLOTH).albedo + 0.3)
+    )
 
 
 def test_a_turned_photo_is_straightened() -> None:

@@ -263,10 +263,7 @@ def test_plugin_against_numba(low, tolerance):
     values = random_materials(rng, n, low)
     bsdf = plugin(FIBERS[0])
     params = mi.traverse(bsdf)
-    for name in NUMBERS:
-        params[name] = mi.Float(values[name])
-    params["albedo"] = mi.Color3f(values["albedo"])
-    params.update()
+    params.update({"albedo": mi.Color3f(values["albedo"]), **{name: mi.Float(values[name]) for name in NUMBERS}})
     wo = toward(rng, n)
     si = hit(wo)
     wi = np.array(sampled(bsdf, si, rng, n)[0].wo)

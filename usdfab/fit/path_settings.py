@@ -38,7 +38,7 @@ class PathSettings:
         the derivatives; only our tracer gives them. ``separate``: as the paper, a picture and then a gradient with
         another seed in each iteration, all forgotten in the next.
     spread:
-        Whether fireflies are spread before the loss sees the picture, see ``path_fireflies``.
+        Whether fireflies are spread before the loss sees the picture, see ``path_noise``.
     steps:
         ``model``: to where the loss is least by the derivatives of all statistics (Gauss-Newton), at most ``trust``
         away in each coordinate; needs recycled passes. ``adam``: as the paper.

@@ -5,7 +5,7 @@
 
 The geometry is frozen. Adam changes the optics until the render's texture and colour are the photo's. What the paper
 leaves open is settled here: `path_space` keeps parameters in their ranges, `path_passes` says where pictures and
-derivatives come from, `path_fireflies` what is done about noise.
+derivatives come from, `path_noise` what is done about noise.
 """
 
 from __future__ import annotations

@@ -18,8 +18,9 @@ from usdfab.fabric import SYSTEMS, FabricParameters
 from usdfab.fabric.optics import ROUGHNESSES
 from usdfab.fabric.parameters import PARAMETER_BY_NAME
 from usdfab.fabric.sampling import sample_fabric
+from usdfab.fit.path_stage import start_from_joint
 from usdfab.fit.raster.unconstrained import soft_range
-from usdfab.fit.raster_stage import StageSettings, refine_by_raster, render_size, traced_albedo
+from usdfab.fit.raster_stage import StageSettings, refine_by_raster, render_size
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import swatch_scene
 
@@ -136,7 +137,7 @@ def evaluate_raster(
             if found.interrupted:
                 return results
             # Without a diffuse term C itself is what path tracing starts from.
-            fabric = traced_albedo(found) if chosen.diffuse else found.fabric
+            fabric = start_from_joint(found.fabric, found.diffuse) if chosen.diffuse else found.fabric
             results.append(
                 Recovery(
                     weave,

@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
-from usdfab.fabric.optics import optics_of, with_optics
+from usdfab.fabric.optics import optics_of
 from usdfab.fit.descent import Progress, State, descend, first_state, load_state
 from usdfab.fit.features import FeatureNet, fast_dtype, load_features
 from usdfab.fit.losses import roughness_prior
@@ -236,12 +236,6 @@ def matching_diffuse(renderer: RasterRenderer, mean: Floats) -> Floats:
     return np.clip(factor * albedo, *START_DIFFUSE)
 
 
-def traced_albedo(result: StageResult) -> FabricParameters:
-    """The found fabric with the albedo from which path tracing starts, C0 = (C + k_d) / 2 (Li et al. 2024, 5.5)."""
-    optics = optics_of(result.fabric)
-    return with_optics(result.fabric, replace(optics, albedo=0.5 * (optics.albedo + result.diffuse)))
-
-
 def straightened(photo: NDArray, rotation: float, pixels_per_meter: float, scale: float) -> NDArray[np.float32]:
     """A photo turned upright and brought to another scale.
 
@@ -298,5 +292,4 @@ __all__: Sequence[str] = (
     "refine_by_raster",
     "render_size",
     "straightened",
-    "traced_albedo",
 )
