@@ -72,7 +72,9 @@ def test_a_killed_stage_leaves_its_state_and_is_resumed(
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (("fit", PHOTO, "--stages", "analysis,path"), "--stages: the path stage is not part of this version"),
+        (("fit", PHOTO, "--stages", "analysis,magic"), "--stages: there is no stage 'magic'"),
+        (("fit", PHOTO, "--stages", "path"), "--stages: the other stages start from the analysis"),
+        (("fit", PHOTO, "--crop", "1,2,3"), "--crop: '1,2,3' is no region"),
         (("fit", PHOTO, "--stages", "raster"), "--stages: the other stages start from the analysis"),
         (("evaluate", "raster", "folder"), "folder: evaluate raster makes its own fabrics"),
         (("evaluate", "raster", "--count", 0), "--count: there is nothing to fit"),

@@ -43,7 +43,7 @@ def quick_features(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("stages", "line"),
     [
-        (("analysis", "path"), "path stage is not part of this version"),
+        (("path",), "start from the analysis"),
         (("analysis", "magic"), "no stage 'magic'"),
         (("raster",), "start from the analysis"),
         (("analysis", "analysis"), "named twice"),
@@ -52,7 +52,7 @@ def quick_features(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_stages_that_cannot_run_are_one_line(stages: tuple[str, ...], line: str) -> None:
     with pytest.raises(UsdfabError, match=line):
         checked_stages(stages)
-    assert checked_stages(("raster", "analysis")) == ("analysis", "raster")
+    assert checked_stages(("path", "raster", "analysis")) == ("analysis", "raster", "path")
 
 
 @pytest.mark.parametrize("closer", [True, False])

@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from usdfab.cli.options import Denoise, Json, Output, Overwrite, Quiet, Seed, print_json, progress_bar, say
+from usdfab.cli.options import (
+    Denoise,
+    Json,
+    Output,
+    Overwrite,
+    Quiet,
+    Seed,
+    parse_region,
+    print_json,
+    progress_bar,
+    say,
+)
 
 if TYPE_CHECKING:
     from usdfab.fit.pipeline import Fit
@@ -19,16 +30,24 @@ def run(
     /,
     *,
     output: Output,
-    size: Annotated[str | None, Parameter(help="Physical width of the picture, e.g. 3.6mm.")] = None,
+    size: Annotated[
+        str | None, Parameter(help="Physical width of the whole picture, also where it is cropped, e.g. 3.6mm.")
+    ] = None,
     pixel_size: Annotated[str | None, Parameter(help="Physical size of a pixel, e.g. 7.5um.")] = None,
+    crop: Annotated[
+        str | None,
+        Parameter(help="Use only X0,Y0,X1,Y1 of the picture: pixels from the top left, or e.g. 25%,25%,75%,75%."),
+    ] = None,
     stages: Annotated[
-        str, Parameter(help="Comma-separated, in order: analysis, raster (slow; needs the fit extra).")
+        str,
+        Parameter(help="Comma-separated, in order: analysis, raster, path (both slow; they need the fit extra)."),
     ] = "analysis",
     quality: Annotated[
-        Literal["draft", "standard", "paper"], Parameter(help="Resolution and iterations of the raster stage.")
+        Literal["draft", "standard", "paper"],
+        Parameter(help="Resolution, samples and iterations of the raster and path stages."),
     ] = "draft",
     resume: Annotated[
-        bool, Parameter(negative="", help="Go on from the state that an unfinished raster stage left beside OUTPUT.")
+        bool, Parameter(negative="", help="Go on from what an unfinished fit left beside OUTPUT.")
     ] = False,
     report: Annotated[Path | None, Parameter(help="Folder for pictures: photo, swatch, side by side.")] = None,
     report_spp: Annotated[int, Parameter(help="Samples per pixel of the report's swatch.")] = 24,
@@ -42,13 +61,17 @@ def run(
 
     The analysis stage reads counts, weave, colours, widths and twist from the photo; fiber parameters it cannot see
     are priors, and what is uncertain is said. The raster stage then moves shape and appearance until a rasterized
-    picture resembles the photo; Ctrl-C ends it early with the best so far.
+    picture resembles the photo, the path stage colours and roughnesses until a path-traced one does; each is used only
+    where it comes closer. Ctrl-C ends them early with the best so far. What is finished is kept beside OUTPUT until
+    the fit is done; after a break --resume goes on from there, to the same result.
 
     Usage examples:
 
         usdfab fit photo.png -o fabric.usda --size 3.6mm
         usdfab fit photo.tif -o fabric.usda --pixel-size 7.5um --report report --json
-        usdfab fit photo.png -o fabric.usda --size 3.6mm --stages analysis,raster --quality standard
+        usdfab fit photo.png -o fabric.usda --size 3.6mm --crop 100,100,900,700
+        usdfab fit photo.png -o fabric.usda --size 3.6mm --stages analysis,raster,path --quality standard
+        usdfab fit photo.png -o fabric.usda --size 3.6mm --stages analysis,raster,path --quality standard --resume
 
     Parameters
     ----------
@@ -58,6 +81,7 @@ def run(
     from usdfab.errors import UsdfabError
     from usdfab.fabric import as_table, parse_length
     from usdfab.files import checked_output
+    from usdfab.fit.fit_checkpoint import CheckpointFiles
     from usdfab.fit.pipeline import fit_photo
     from usdfab.fit.report import write_report
     from usdfab.imaging import check_denoiser
@@ -71,7 +95,15 @@ def run(
         raise UsdfabError(f"{seed} is not between 0 and 2^31 - 1", place="--seed")
     width = parse_length(size) if size else None
     pixel = parse_length(pixel_size) if pixel_size else None
-    state = output.with_name(f"{output.name}.raster.safetensors")
+    region = parse_region(crop, "--crop")
+    files = CheckpointFiles(output)
+    left = files.existing()
+    if left and not (resume or overwrite):
+        raise UsdfabError(
+            "an unfinished fit is there",
+            place=str(left[0]),
+            remedy="go on with --resume or start anew with --overwrite",
+        )
     with progress_bar("fitting", quiet=quiet) as update:
         fit = fit_photo(
             photo,
@@ -81,14 +113,16 @@ def run(
             lambda text, done, total: update(done, total, text),
             stages=[name.strip() for name in stages.split(",")],
             quality=quality,
-            checkpoint=state,
+            crop=region.pixels if region else None,
+            checkpoint=files,
             resume=resume,
         )
     write_fabric(fit.fabric, output, overwrite=overwrite)
-    if not any(stage.interrupted for stage in fit.stages):
-        state.unlink(missing_ok=True)
+    stopped = next((stage.name for stage in fit.stages if stage.interrupted), None)
+    if stopped is None:
+        files.remove()
     elif not quiet:
-        say(f"the raster stage was interrupted: --resume --overwrite goes on from {state}")
+        say(f"the {stopped} stage was interrupted: the same command with --resume --overwrite goes on from there")
     pictures: dict[str, Path] = {}
     if report is not None:
         with progress_bar("rendering the report", quiet=quiet) as update:
@@ -119,6 +153,8 @@ def run(
 
 
 def _stages(fit: Fit) -> list[dict[str, Any]]:
+    from usdfab.fabric import as_table
+
     return [
         {
             "name": stage.name,
@@ -127,6 +163,9 @@ def _stages(fit: Fit) -> list[dict[str, Any]]:
             "losses": [loss if math.isfinite(loss) else None for loss in stage.losses],
             "distance": stage.distance,
             "notes": list(stage.notes),
+            "interrupted": stage.interrupted,
+            "uncertainty": dict(stage.uncertainty),
+            "parameters": {name: as_table(stage.fabric)[name] for name in ("warp", "weft")},
         }
         for stage in fit.stages
     ]

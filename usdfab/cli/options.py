@@ -83,7 +83,7 @@ class Region:
         return x0, y0, x1, y1
 
 
-def parse_region(text: str | None) -> Region | None:
+def parse_region(text: str | None, option: str = "--region") -> Region | None:
     """``10,20,200,100`` in pixels from the top left, upper ends excluded, or ``25%,25%,75%,75%``."""
     if text is None:
         return None
@@ -92,7 +92,7 @@ def parse_region(text: str | None) -> Region | None:
     whole = all(percent or number.is_integer() for number, percent in found)
     if len(parts) != 4 or len(found) != 4 or not whole:
         raise UsdfabError(
-            f"'{text}' is no region", place="--region", remedy="write x0,y0,x1,y1 in pixels or e.g. 25%,25%,75%,75%"
+            f"'{text}' is no region", place=option, remedy="write x0,y0,x1,y1 in pixels or e.g. 25%,25%,75%,75%"
         )
     (a, b, c, d), (p, q, r, s) = zip(*found, strict=True)
     return Region((a, b, c, d), (p, q, r, s))

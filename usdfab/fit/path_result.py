@@ -48,6 +48,8 @@ class PathResult:
         Millions of camera paths in this process.
     seconds:
         In this process.
+    interrupted:
+        Whether Ctrl-C ended it early.
     """
 
     fabric: FabricParameters
@@ -60,6 +62,7 @@ class PathResult:
     loss: float
     paths: float
     seconds: float
+    interrupted: bool = False
 
     def summary(self) -> dict[str, object]:
         """For ``--json``."""

@@ -74,6 +74,7 @@ def refine_appearance(
     renderer: Renderer | None = None,
     checkpoint: str | Path | None = None,
     progress: Progress | None = None,
+    keep_interrupted: bool = False,
 ) -> PathResult:
     """Refine a fabric's colours and roughnesses until its render looks as the photo does.
 
@@ -98,6 +99,8 @@ def refine_appearance(
         bit, as without the interruption. It stays; a finished one gives its result at once.
     progress:
         Called after each iteration.
+    keep_interrupted:
+        After Ctrl-C, give the best so far, ``interrupted``, instead of raising ``KeyboardInterrupt``.
 
     Raises
     ------
@@ -132,7 +135,9 @@ def refine_appearance(
         state, saved = load_state(file, identity)
         passes.restore(saved)
     before = state.iteration
-    state = _optimise(state, space, passes, loss, clean, small, settings, file, identity, progress)
+    state = _optimise(
+        state, space, passes, loss, clean, small, settings, file, identity, progress, keep_interrupted
+    )  # fmt: skip
     point, least = chosen_point(state)
     found = renderer.optics.with_vector(space.vector(point[:-1]))
     paths = 1e-6 * size[0] * size[1] * (settings.spp + settings.gradient_spp) * (state.iteration - before)
@@ -147,6 +152,7 @@ def refine_appearance(
         least,
         paths,
         time.perf_counter() - began,
+        state.iteration < settings.iterations,
     )
 
 
@@ -196,6 +202,7 @@ def _optimise(
     file: Path | None,
     identity: str,
     progress: Progress | None,
+    keep_interrupted: bool,
 ) -> State:
     """All iterations that are left. An interruption from the keyboard leaves a checkpoint of the last whole one."""
     saved, kept = time.perf_counter(), passes.state()
@@ -208,6 +215,9 @@ def _optimise(
             if file is not None and time.perf_counter() - saved > SAVE_SECONDS:
                 save_state(file, identity, state, kept)
                 saved = time.perf_counter()
+    except KeyboardInterrupt:
+        if not (keep_interrupted and np.isfinite(state.losses[:, 0]).any()):
+            raise
     finally:
         if file is not None and state.iteration > 0:
             save_state(file, identity, state, kept)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,20 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from usdfab._version import __version__
-from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, Provenance
-from usdfab.fabric.fabric import SIZE_RANGE
 from usdfab.fit.albedo import LADDER, PATHS, REFINEMENTS, brightness_curves, with_inverted_albedo
 from usdfab.fit.analysis import PhotoAnalysis, analyze_photo
+from usdfab.fit.course import Course, Progress
+from usdfab.fit.fit_checkpoint import CheckpointFiles, FitCheckpoint
+from usdfab.fit.later_stages import LaterStages
+from usdfab.fit.photo_input import DEFAULT_WIDTH as DEFAULT_WIDTH, Crop, Photo, load_photo
 from usdfab.fit.priors import fabric_from_analysis
-from usdfab.fit.stages import StageOutcome, checked_stages, run_raster
-from usdfab.imaging import read_image
+from usdfab.fit.stages import StageOutcome, checked_stages
 
-DEFAULT_WIDTH = 5e-3
-"""Width in metres that a photo is taken to have when nothing says how large it is."""
-
-Progress = Callable[[str, int, int], None]
-"""Called with (what is being done, steps done, steps to do)."""
+ANALYSIS_SECONDS = 15.0
+"""What the analysis takes, about, with the renders that find albedos."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +51,8 @@ def fit_photo(
     *,
     stages: Sequence[str] = ("analysis",),
     quality: str = "draft",
-    checkpoint: Path | None = None,
+    crop: Crop | None = None,
+    checkpoint: CheckpointFiles | None = None,
     resume: bool = False,
 ) -> Fit:
     """Estimate a fabric from one photo.
@@ -64,90 +62,87 @@ def fit_photo(
     path:
         An image file of woven cloth seen straight from above, yarns roughly along the picture's sides.
     width, pixel_size:
-        Physical width of the whole picture, or of one pixel, in metres. Without both, the file's resolution tags
-        count; without those, ``DEFAULT_WIDTH``, with a warning.
+        Physical width of the whole picture, before the crop, or of one pixel, in metres. Without both, the file's
+        resolution tags count; without those, ``DEFAULT_WIDTH``, with a warning.
     seed:
         Fixes the fabric's random draws and those of the renders made on the way.
+    progress:
+        Called with steps of all stages together.
     albedo_paths:
         Paths in each render by which albedos are found; fewer are faster and noisier.
     stages, quality:
         Which of ``stages.STAGES`` run; resolution and iterations of those after the analysis: draft, standard, paper.
+    crop:
+        The part of the photo to use.
     checkpoint, resume:
-        A file in which the raster stage keeps its state every few iterations, and whether to go on from it. It is left
-        there at the end.
+        Files in which finished stages are kept, and those at work every few iterations; and whether to go on from
+        them, to the same result as without the break. They are left there at the end. Ctrl-C in a stage after the
+        analysis ends the fit with the best so far, and that stage is marked as interrupted.
 
     Raises
     ------
     UsdfabError
-        For a file that is no image, too small, or shows no woven cloth; for stages and qualities that there are not.
+        For a file that is no image, too small, or shows no woven cloth; for stages and qualities that there are not;
+        for a checkpoint of another fit.
     """
-    say = progress or (lambda *_: None)
     wanted = checked_stages(stages)
-    settings = None
-    if "raster" in wanted:
-        from usdfab.fit.raster_stage import checked_quality
+    later = LaterStages.of(wanted, quality, seed, albedo_paths, checkpoint)
+    photo = load_photo(path, width, pixel_size, crop)
+    if checkpoint is not None and not resume:
+        checkpoint.remove()
+    about = {
+        "photo": photo.sha256, "size": photo.width, "crop": photo.box, "seed": seed, "paths": albedo_paths,
+        "version": __version__,
+    }  # fmt: skip
+    kept = FitCheckpoint.begin(checkpoint.fit if checkpoint else None, about, resume)
+    first = kept.finished(0, "analysis", "")
+    course = Course(progress, ({} if first else {"analysis": ANALYSIS_SECONDS}) | later.costs())
+    if first is None:
+        first = _analysed(photo, path, seed, albedo_paths, kept, course.stage("analysis"))
+        kept.add("", first)
+    course.finish("analysis")
+    assert kept.photo is not None
+    analysis, shown, prior_notes = kept.photo
+    warnings = list(analysis.warnings)
+    if photo.size_source == "default":
+        warnings.insert(
+            0, f"nothing says how large the photo is: its width is taken as {DEFAULT_WIDTH * 1e3:g} mm; use --size"
+        )
+    outcomes = later.run(first, shown, photo.pixels, analysis.rotation, kept, course)
+    warnings += dict.fromkeys(note for outcome in outcomes for note in outcome.notes)
+    notes = [f"size from {photo.size_source}", *photo.notes, *_confidences(analysis), *warnings, *prior_notes]
+    provenance = Provenance(
+        source=Path(path).name,
+        source_sha256=photo.sha256,
+        generator=f"usdfab {__version__}",
+        stages=tuple(outcome.name for outcome in outcomes),
+        notes=tuple(notes),
+    )
+    fabric = replace(outcomes[-1].fabric, provenance=provenance)
+    return Fit(fabric, analysis, photo.pixels, photo.size_source, (*photo.notes, *warnings), outcomes)
 
-        settings = checked_quality(quality)
+
+def _analysed(
+    photo: Photo, path: str | Path, seed: int, albedo_paths: int, kept: FitCheckpoint, say: Progress
+) -> StageOutcome:
+    """The first stage. What the photo showed goes into ``kept``."""
     begun = time.perf_counter()
-    say("reading", 0, 8)
-    image = read_image(path)
-    photo = image.pixels
-    width, source = _physical_width(photo.shape[1], width, pixel_size, image.pixel_size)
-    say("analysing", 1, 8)
-    analysis = analyze_photo(photo.astype(np.float64), str(path))
-    shown, prior_notes = fabric_from_analysis(analysis, width, seed, _prim_name(Path(path).stem))
     ladder, steps = len(LADDER), 2 + len(LADDER) + REFINEMENTS
+    say("analysing", 1, steps)
+    analysis = analyze_photo(photo.pixels.astype(np.float64), str(path))
+    shown, prior_notes = fabric_from_analysis(analysis, photo.width, seed, _prim_name(Path(path).stem))
+    kept.photo = analysis, shown, prior_notes
     curves = brightness_curves(
         shown, albedo_paths, seed=seed, progress=lambda done, _: say("measuring albedo", 2 + done, steps)
     )
-    fabric, albedo_notes = with_inverted_albedo(
+    fabric, notes = with_inverted_albedo(
         shown,
         curves,
         albedo_paths,
         seed=seed,
         progress=lambda done, _: say("measuring albedo", 2 + ladder + done, steps),
     )
-    warnings = list(analysis.warnings) + list(albedo_notes)
-    if source == "default":
-        warnings.insert(
-            0, f"nothing says how large the photo is: its width is taken as {DEFAULT_WIDTH * 1e3:g} mm; use --size"
-        )
-    outcomes: tuple[StageOutcome, ...] = (StageOutcome("analysis", fabric, time.perf_counter() - begun),)
-    if settings is not None:
-        before, after = run_raster(
-            fabric, shown, photo, analysis.rotation, settings, seed=seed, albedo_paths=albedo_paths,
-            checkpoint=checkpoint, resume=resume, progress=say,
-        )  # fmt: skip
-        outcomes = (replace(before, seconds=outcomes[0].seconds), after)
-        fabric = after.fabric
-        warnings += after.notes
-    notes = [f"size from {source}", *_confidences(analysis), *warnings, *prior_notes]
-    provenance = Provenance(
-        source=Path(path).name,
-        source_sha256=hashlib.sha256(Path(path).read_bytes()).hexdigest(),
-        generator=f"usdfab {__version__}",
-        stages=wanted,
-        notes=tuple(notes),
-    )
-    return Fit(replace(fabric, provenance=provenance), analysis, photo, source, tuple(warnings), outcomes)
-
-
-def _physical_width(
-    columns: int, width: float | None, pixel_size: float | None, tagged: tuple[float, float] | None
-) -> tuple[float, str]:
-    if width is not None and pixel_size is not None:
-        raise UsdfabError("--size and --pixel-size both say how large the photo is", remedy="use one of them")
-    if width is not None:
-        value, source = width, "--size"
-    elif pixel_size is not None:
-        value, source = pixel_size * columns, "--pixel-size"
-    elif tagged is not None:
-        value, source = tagged[0] * columns, "the file's resolution"
-    else:
-        value, source = DEFAULT_WIDTH, "default"
-    if not SIZE_RANGE[0] <= value <= SIZE_RANGE[1]:
-        raise UsdfabError(f"a photo {value:g} m wide (from {source}) is not plausible", remedy="use --size, e.g. 3.6mm")
-    return value, source
+    return StageOutcome("analysis", fabric, time.perf_counter() - begun, notes=tuple(notes))
 
 
 def _confidences(analysis: PhotoAnalysis) -> list[str]:

@@ -1,10 +1,10 @@
-"""The stages of ``usdfab fit``: their names, what each found, and the raster stage as the pipeline runs it."""
+"""The stages of ``usdfab fit``: their names, what each found, how that is judged, and the raster stage as it is run."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,7 +37,8 @@ class StageOutcome:
 
     ``losses`` of its iterations, if it has any; ``seconds`` it took; ``distance`` of the path-traced swatch from the
     photo by the losses of the fit, where that was measured; ``notes`` are sentences for people; ``interrupted`` after
-    Ctrl-C.
+    Ctrl-C. ``halfway`` is the raster stage's fabric with the albedos (C + k_d) / 2 (Li et al. 2024, 7.3), another start
+    for the path stage. ``uncertainty`` of parameters by name, where the stage knows any, in their own units.
     """
 
     name: str
@@ -47,6 +48,8 @@ class StageOutcome:
     distance: float | None = None
     notes: tuple[str, ...] = ()
     interrupted: bool = False
+    halfway: FabricParameters | None = None
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
 
 def checked_stages(stages: Sequence[str]) -> tuple[str, ...]:
@@ -55,7 +58,7 @@ def checked_stages(stages: Sequence[str]) -> tuple[str, ...]:
     Raises
     ------
     UsdfabError
-        For unknown names, a missing analysis, a stage that does not exist yet, and one whose packages are missing.
+        For unknown names, a missing analysis, and a stage whose packages are missing.
     """
     names = tuple(stages)
     unknown = [name for name in names if name not in STAGES]
@@ -64,12 +67,9 @@ def checked_stages(stages: Sequence[str]) -> tuple[str, ...]:
         raise UsdfabError(problem, place="--stages", remedy=f"choose from {','.join(STAGES)}")
     if "analysis" not in names:
         raise UsdfabError("the other stages start from the analysis", place="--stages", remedy="begin with analysis")
-    if "path" in names:
-        raise UsdfabError(
-            "the path stage is not part of this version", place="--stages", remedy="use analysis or analysis,raster"
-        )
-    if "raster" in names:
-        require_fit_extra("the raster stage")
+    for name in names:
+        if name != "analysis":
+            require_fit_extra(f"the {name} stage")
     return tuple(name for name in STAGES if name in names)
 
 
@@ -106,6 +106,7 @@ def run_raster(
         is the start.
     """
     from usdfab.fit.features import fast_dtype, load_features
+    from usdfab.fit.path_stage import start_from_joint
     from usdfab.fit.raster.unconstrained import within_ranges
     from usdfab.fit.raster_stage import refine_by_raster, straightened
 
@@ -117,7 +118,7 @@ def run_raster(
     tame, outside = within_ranges(start)
     notes = [f"{name} was outside the raster stage's range and starts at its border" for name in outside]
     ladder, extra = len(LADDER), len(LADDER) + REFINEMENTS
-    steps = settings.iterations + extra
+    steps = settings.iterations + extra + 1
     result = refine_by_raster(
         tame, target, settings, net=net, checkpoint=checkpoint, resume=resume,
         progress=lambda done, _, loss: say(f"raster, loss {loss:.3f}", done, steps),
@@ -139,14 +140,18 @@ def run_raster(
         dyed, curves, albedo_paths, seed=seed, progress=lambda k, _: say("measuring albedo", done + ladder + k, steps)
     )
     notes += albedo_notes
+    halfway: FabricParameters | None = start_from_joint(result.fabric, result.diffuse)
+    say("judging the raster stage", steps - 1, steps)
     before, after = (traced_distance(fabric, target, settings, net, seed) for fabric in (start, found))
     if not after < before:
         notes.append(f"the raster stage did not come closer to the photo ({before:.3f}, then {after:.3f}): not used")
-        found = start
+        found, halfway = start, None
     seconds = time.perf_counter() - begun
     return (
         StageOutcome("analysis", start, 0.0, distance=before),
-        StageOutcome("raster", found, seconds, result.losses, min(before, after), tuple(notes), result.interrupted),
+        StageOutcome(
+            "raster", found, seconds, result.losses, min(before, after), tuple(notes), result.interrupted, halfway
+        ),
     )
 
 
