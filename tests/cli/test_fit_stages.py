@@ -37,9 +37,10 @@ def test_both_stages_with_report(run: Run, quick: None, tmp_path: Path) -> None:
     assert (analysis["name"], raster["name"]) == ("analysis", "raster")
     assert len(raster["losses"]) == 2
     assert raster["distance"] <= analysis["distance"]
-    names = {"photo", "after_analysis", "swatch", "comparison", "raster_loss"}
+    names = {"photo", "after_analysis", "swatch", "comparison", "difference", "drape", "raster_loss"}
     assert set(result["pictures"]) == names
-    assert {p.stem for p in report.iterdir()} == names
+    assert {p.name for p in report.iterdir()} == {f"{n}.png" for n in names} | {"report.html"}
+    assert result["report"] == str(report / "report.html")
     sizes = {n: read_image(report / f"{n}.png").pixels.shape for n in names}
     assert sizes["comparison"][1] == 3 * sizes["photo"][1] + 16
     assert read_fabric(out).provenance.stages == ("analysis", "raster")

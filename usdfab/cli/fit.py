@@ -49,8 +49,8 @@ def run(
     resume: Annotated[
         bool, Parameter(negative="", help="Go on from what an unfinished fit left beside OUTPUT.")
     ] = False,
-    report: Annotated[Path | None, Parameter(help="Folder for pictures: photo, swatch, side by side.")] = None,
-    report_spp: Annotated[int, Parameter(help="Samples per pixel of the report's swatch.")] = 24,
+    report: Annotated[Path | None, Parameter(help="Folder for a page, report.html, and its pictures.")] = None,
+    report_spp: Annotated[int, Parameter(help="Samples per pixel of the report's pictures.")] = 24,
     denoise: Denoise = False,
     seed: Seed = 0,
     overwrite: Overwrite = False,
@@ -83,7 +83,7 @@ def run(
     from usdfab.files import checked_output
     from usdfab.fit.fit_checkpoint import CheckpointFiles
     from usdfab.fit.pipeline import fit_photo
-    from usdfab.fit.report import write_report
+    from usdfab.fit.report import PAGE, write_report
     from usdfab.imaging import check_denoiser
     from usdfab.usd.atomic import USD_SUFFIXES
     from usdfab.usd.fabric_io import write_fabric
@@ -127,8 +127,9 @@ def run(
     if report is not None:
         with progress_bar("rendering the report", quiet=quiet) as update:
             pictures = write_report(
-                fit, report, spp=report_spp, seed=seed, denoised=denoise, overwrite=overwrite, progress=update
-            )
+                fit, report, spp=report_spp, seed=seed, denoised=denoise, overwrite=overwrite, asset=output,
+                progress=update,
+            )  # fmt: skip
     if not quiet:
         for warning in fit.warnings:
             say(f"warning: {warning}")
@@ -139,7 +140,8 @@ def run(
                 "fabric": as_table(fit.fabric),
                 "analysis": _analysis(fit),
                 "stages": _stages(fit),
-                "pictures": pictures,
+                "pictures": {name: path for name, path in pictures.items() if name != PAGE},
+                "report": pictures.get(PAGE),
             }
         )
     elif not quiet:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from usdfab.fabric import FabricParameters
 from usdfab.fit import stages
 from usdfab.fit.stages import StageOutcome
+from usdfab.fit.straighten import straightened
 from usdfab.usd.rig import rig_for, swatch_scene
 
 if TYPE_CHECKING:
@@ -63,7 +64,6 @@ def run_path(
     """
     from usdfab.fit.features import fast_dtype, load_features
     from usdfab.fit.path_stage import refine_appearance
-    from usdfab.fit.raster_stage import straightened
 
     say = progress or (lambda *_: None)
     begun = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Pictures of a fit: the photo and the swatches after each stage under the capture rig, side by side at one scale."""
+"""The report of a fit: an HTML page, and its pictures beside it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,23 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from usdfab.errors import UsdfabError
+from usdfab.files import whole_file
+from usdfab.fit.comparison import difference
+from usdfab.fit.course import Course
 from usdfab.fit.pipeline import Fit
+from usdfab.fit.report_page import report_page
+from usdfab.fit.straighten import straightened
 from usdfab.imaging import denoise, side_by_side, write_image
 from usdfab.tracer import RenderSettings, Tracer
+from usdfab.usd.drape import drape_scene
 from usdfab.usd.rig import swatch_scene
 
 HEIGHT = 480
 """Rows of the report's pictures."""
+
+DRAPE_SIZE = (640, 480)
+PAGE = "report"
+"""The page's name among the report's files."""
 
 
 def write_report(
@@ -27,18 +37,40 @@ def write_report(
     seed: int = 0,
     denoised: bool = False,
     overwrite: bool = False,
+    asset: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Path]:
-    """Write ``photo.png``, ``swatch.png`` and ``comparison.png`` (photo, then a swatch for each stage) into ``folder``.
+    """Write ``report.html`` into ``folder``, a page that needs nothing else, and its pictures as PNG beside it.
 
-    After several stages there is also ``after_STAGE.png`` for each but the last, and for a stage with iterations its
-    ``STAGE_loss.png``. ``denoised`` cleans the swatches with the denoiser. The folder is made if it is missing. Returns
-    the paths by name.
+    These are ``photo``, ``swatch``, ``comparison`` (photo, then a swatch for each stage), ``difference`` (fit minus
+    photo), ``drape``; after several stages ``after_STAGE`` for each but the last, and for a stage with iterations
+    ``STAGE_loss``.
+
+    Parameters
+    ----------
+    folder:
+        Made if it is missing.
+    spp, seed, denoised:
+        Of the pictures; ``denoised`` cleans them with the denoiser.
+    asset:
+        The USD file that the fit was written to, for the page to name.
+    progress:
+        Called with (steps done, steps to do) of all pictures together.
+
+    Returns
+    -------
+    The paths by name, the page as ``report``.
+
+    Raises
+    ------
+    UsdfabError
+        If a file is there already (unless ``overwrite``) or cannot be written.
     """
     target = Path(folder)
     earlier, curves = fit.stages[:-1], [stage for stage in fit.stages if len(stage.losses) > 1]
-    names = ["photo", *(f"after_{stage.name}" for stage in earlier), "swatch", "comparison"]
-    paths = {name: target / f"{name}.png" for name in (*names, *(f"{stage.name}_loss" for stage in curves))}
+    shown = {f"after_{stage.name}": stage.fabric for stage in earlier} | {"swatch": fit.fabric}
+    names = ["photo", *shown, "comparison", "difference", "drape", *(f"{stage.name}_loss" for stage in curves)]
+    paths = {name: target / f"{name}.png" for name in names} | {PAGE: target / f"{PAGE}.html"}
     if target.exists() and not target.is_dir():
         raise UsdfabError("a file is in the folder's place", place=str(target), remedy="choose another folder")
     existing = [p for p in paths.values() if p.exists()]
@@ -49,17 +81,32 @@ def write_report(
     except OSError as error:
         raise UsdfabError(f"cannot make the folder ({error.strerror})", place=str(target)) from error
     photo = resized(fit.photo, HEIGHT)
-    settings = RenderSettings((photo.shape[1], photo.shape[0]), spp=spp, seed=seed)
+    size = (photo.shape[1], photo.shape[0])
+    scenes = {name: (swatch_scene(fabric), size) for name, fabric in shown.items()}
+    scenes["drape"] = (drape_scene(fit.fabric, DRAPE_SIZE[0] / DRAPE_SIZE[1]), DRAPE_SIZE)
+    course = Course(lambda _, done, total: progress(done, total) if progress else None, dict.fromkeys(scenes, 1.0))
     pictures = {"photo": photo}
-    shown = {f"after_{stage.name}": stage.fabric for stage in earlier} | {"swatch": fit.fabric}
-    for name, fabric in shown.items():
-        scene = swatch_scene(fabric)
-        render = Tracer(scene).render(scene.cameras[0], settings, progress)
+    for name, (scene, resolution) in scenes.items():
+        within = course.stage(name)
+        settings = RenderSettings(resolution, spp=spp, seed=seed)
+        render = Tracer(scene).render(
+            scene.cameras[0], settings, lambda done, total, within=within: within("", done, total)  # type: ignore[misc]
+        )  # fmt: skip
+        course.finish(name)
         pictures[name] = denoise(render.pixels, render.albedo, render.normal) if denoised else render.pixels
-    pictures["comparison"] = side_by_side(list(pictures.values()))
+    pictures["comparison"] = side_by_side([pictures["photo"], *(pictures[name] for name in shown)])
+    scale = photo.shape[1] / fit.fabric.size[0]
+    upright = straightened(fit.photo, fit.analysis.rotation, fit.photo.shape[1] / fit.fabric.size[0], scale)
+    pictures["difference"], correlation = difference(upright, pictures["swatch"], fit.fabric)
     pictures |= {f"{stage.name}_loss": loss_curve(stage.losses) for stage in curves}
-    for name, path in paths.items():
-        write_image(path, pictures[name], overwrite=overwrite)
+    for name in names:
+        write_image(paths[name], pictures[name], overwrite=overwrite)
+    page = report_page(fit, {name: paths[name] for name in names}, asset=asset, correlation=correlation)
+    try:
+        with whole_file(paths[PAGE]) as temporary:
+            temporary.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise UsdfabError(f"cannot be written ({error.strerror})", place=str(paths[PAGE])) from error
     return paths
 
 
