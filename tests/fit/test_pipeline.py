@@ -14,7 +14,14 @@ from cloth_drawing import Cloth, draw
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, YarnParameters, weave_from_name
 from usdfab.fibers import generate_patch
-from usdfab.fit.albedo import BrightnessCurve, brightness_curves, visible_means, with_inverted_albedo
+from usdfab.fit.albedo import (
+    BrightnessCurve,
+    brightness_curves,
+    dimmed,
+    photo_exposure,
+    visible_means,
+    with_inverted_albedo,
+)
 from usdfab.fit.analysis import PhotoAnalysis, YarnSystem
 from usdfab.fit.pipeline import DEFAULT_WIDTH, fit_photo
 from usdfab.fit.priors import fabric_from_analysis
@@ -124,6 +131,19 @@ def test_too_bright_a_photo_is_said() -> None:
     fabric, notes = with_inverted_albedo(bright, curves)  # type: ignore[arg-type]
     assert fabric.warp.albedo == pytest.approx((0.995,) * 3)
     assert any("warp is brighter" in note for note in notes)
+
+
+def test_light_is_taken_as_stronger_where_white_fibers_are_too_dark() -> None:
+    # Brightness is 0.6 times albedo, so fibers of 0.95 give 0.57.
+    curves = dict.fromkeys(("warp", "weft"), BrightnessCurve(np.array([0.0, 1.0]), np.array([0.0, 0.6])))
+    dark = replace(CLOTH, warp=replace(CLOTH.warp, albedo=(0.5, 0.1, 0.1)))
+    dark = replace(dark, weft=replace(CLOTH.weft, albedo=(0.3, 0.3, 0.3)))
+    white = replace(dark, weft=replace(CLOTH.weft, albedo=(0.2, 0.2, 0.2), yarn_albedo=((0.9, 0.95, 0.9), (0.1,) * 3)))
+    assert photo_exposure(dark, curves) == 1.0  # type: ignore[arg-type]
+    exposure = photo_exposure(white, curves)  # type: ignore[arg-type]
+    assert exposure == pytest.approx(0.95 / 0.57)
+    assert photo_exposure(dimmed(white, exposure), curves) == pytest.approx(1.0)  # type: ignore[arg-type]
+    assert dimmed(white, 2.0).weft.yarn_albedo[0] == pytest.approx((0.45, 0.475, 0.45))
 
 
 @pytest.fixture(scope="module")

@@ -139,6 +139,7 @@ def run(
                 "output": output,
                 "fabric": as_table(fit.fabric),
                 "analysis": _analysis(fit),
+                "exposure": fit.exposure,
                 "stages": _stages(fit),
                 "pictures": {name: path for name, path in pictures.items() if name != PAGE},
                 "report": pictures.get(PAGE),

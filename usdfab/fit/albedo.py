@@ -28,6 +28,9 @@ OVER_RELAXATION = 1.7
 """Only about half of what a system shows comes from its own albedo's curve, so corrections are taken larger."""
 
 MAX_ALBEDO = 0.995
+BRIGHT_ALBEDO = 0.95
+"""Albedo of the brightest yarns of a photo that shows more light than the rig's standard exposure can explain."""
+
 PATHS = 300_000
 """Paths in each render; a mean brightness is then good to about 2 %."""
 
@@ -74,13 +77,36 @@ def brightness_curves(
     }
 
 
+def photo_exposure(shown: FabricParameters, curves: dict[System, BrightnessCurve]) -> float:
+    """How many times brighter than under the rig's standard light a photo is, 1 or more.
+
+    Light and albedo cannot be told apart in one photo. The rig's light is normalised so that a white diffuse surface
+    is 1, and cloth of white fibers is darker than that; a camera, however, exposes white cloth as white. So where the
+    photo's colours ask for more than fibers of albedo ``BRIGHT_ALBEDO`` give, the light was stronger.
+
+    Parameters
+    ----------
+    shown:
+        The fabric with the photo's linear colours as albedo.
+    curves:
+        From ``brightness_curves`` of the same fabric.
+    """
+    needed = 1.0
+    for system in SYSTEMS:
+        curve = curves[system]
+        possible = float(np.interp(BRIGHT_ALBEDO, curve.albedo, curve.brightness))
+        needed = max(needed, float(np.max(shown.system(system).colors())) / max(possible, 1e-6))
+    return needed
+
+
 def visible_means(fabric: FabricParameters, paths: int = PATHS, seed: int = 0) -> dict[System, NDArray[np.float64]]:
     """Mean colour (3,) of each system in the rendered swatch, over the middles of the crossings where it is on top."""
     cells = np.array([fabric.size[0], fabric.size[1]]) / fabric.cell
     width = int(np.clip(PIXELS_PER_CELL * cells[0], 32, MAX_PIXELS))
     height = max(1, round(width * fabric.size[1] / fabric.size[0]))
     spp = max(1, round(paths / (width * height)))
-    scene = swatch_scene(fabric)
+    # One variant of the repeat shows the same colours as several, which take as many times as long to build.
+    scene = swatch_scene(replace(fabric, variants=1))
     render = Tracer(scene).render(scene.cameras[0], RenderSettings((width, height), spp=spp, seed=seed))
     return means_on_top(render.pixels, fabric)
 
@@ -134,13 +160,25 @@ def _read_backwards(
     fabric: FabricParameters, curves: dict[System, BrightnessCurve], factors: dict[System, NDArray[np.float64]]
 ) -> FabricParameters:
     """Each colour of ``fabric``, times its system's factors, replaced by the albedo that shows it."""
+
+    def albedo(system: System, color: Color) -> Color:
+        wanted = np.asarray(color) * factors[system]
+        red, green, blue = (min(curves[system].albedo_of(float(c)), MAX_ALBEDO) for c in wanted)
+        return red, green, blue
+
+    return with_colors(fabric, albedo)
+
+
+def dimmed(fabric: FabricParameters, exposure: float) -> FabricParameters:
+    """``fabric`` with all its colours divided by an exposure of 1 or more."""
+    return with_colors(fabric, lambda _, c: (c[0] / exposure, c[1] / exposure, c[2] / exposure))
+
+
+def with_colors(fabric: FabricParameters, change: Callable[[System, Color], Color]) -> FabricParameters:
+    """``fabric`` with every colour of each system replaced by ``change`` of it."""
     for system in SYSTEMS:
         yarn = fabric.system(system)
-
-        def albedo(color: Color, curve: BrightnessCurve = curves[system], factor: NDArray = factors[system]) -> Color:
-            red, green, blue = (min(curve.albedo_of(float(c)), MAX_ALBEDO) for c in np.asarray(color) * factor)
-            return red, green, blue
-
-        changed = replace(yarn, albedo=albedo(yarn.albedo), yarn_albedo=tuple(albedo(c) for c in yarn.yarn_albedo))
+        colors = tuple(change(system, c) for c in yarn.yarn_albedo)
+        changed = replace(yarn, albedo=change(system, yarn.albedo), yarn_albedo=colors)
         fabric = replace(fabric, **{system: changed})  # type: ignore[arg-type]
     return fabric

@@ -6,11 +6,11 @@ from importlib.util import find_spec
 
 from usdfab.errors import UsdfabError
 
-PACKAGES = ("torch", "safetensors")
+PACKAGES = ("torch", "safetensors", "mitsuba_oidn")
 
 
 def require_fit_extra(what: str) -> None:
-    """Raise one clear line where torch or safetensors is not installed; ``what`` needs them. Imports neither."""
+    """Raise one clear line where one of ``PACKAGES`` is not installed; ``what`` needs them. Imports none."""
     missing = [name for name in PACKAGES if find_spec(name) is None]
     if missing:
         raise UsdfabError(f"{what} needs {' and '.join(missing)}", remedy="pip install 'usdfab[fit]'")

@@ -44,17 +44,22 @@ class CheckpointFiles:
         return self.output.with_name(f"{self.output.name}.raster.safetensors")
 
     @property
+    def match(self) -> Path:
+        """The state of the match stage."""
+        return self.output.with_name(f"{self.output.name}.match.npz")
+
+    @property
     def path(self) -> Path:
         """The state of the path stage."""
         return self.output.with_name(f"{self.output.name}.path.npz")
 
     def existing(self) -> list[Path]:
         """Those that are there."""
-        return [file for file in (self.fit, self.raster, self.path) if file.exists()]
+        return [file for file in (self.fit, self.raster, self.match, self.path) if file.exists()]
 
     def remove(self) -> None:
         """Nothing is left to resume."""
-        for file in (self.fit, self.raster, self.path):
+        for file in (self.fit, self.raster, self.match, self.path):
             file.unlink(missing_ok=True)
 
 
@@ -211,6 +216,7 @@ def _stage_table(stage: StageOutcome) -> dict[str, Any]:
         "seconds": stage.seconds,
         "losses": [loss if math.isfinite(loss) else None for loss in stage.losses],
         "distance": stage.distance,
+        "exposure": stage.exposure,
         "notes": list(stage.notes),
         "uncertainty": dict(stage.uncertainty),
     }
@@ -225,5 +231,6 @@ def _stage(table: dict[str, Any]) -> StageOutcome:
         table["distance"],
         tuple(table["notes"]),
         halfway=None if table["halfway"] is None else fabric_from_table(table["halfway"]),
+        exposure=float(table["exposure"]),
         uncertainty=dict(table["uncertainty"]),
     )

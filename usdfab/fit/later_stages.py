@@ -13,6 +13,7 @@ from usdfab.fit.fit_checkpoint import CheckpointFiles, FitCheckpoint
 from usdfab.fit.stages import StageOutcome, run_raster
 
 if TYPE_CHECKING:
+    from usdfab.fit.match_stage import MatchSettings
     from usdfab.fit.path_settings import PathSettings
     from usdfab.fit.raster_stage import StageSettings
 
@@ -21,6 +22,9 @@ SECONDS_PER_SAMPLE, SECONDS_PER_ITERATION = 1e-4, 1.0
 
 SECONDS_PER_MILLION_PATHS, SECONDS_PER_STEP = 10.0, 2.0
 """Of the path stage, about."""
+
+SECONDS_PER_MATCH_SAMPLE = 1.2e-5
+"""Of the match stage, about, features included."""
 
 JUDGING_SECONDS = 15.0
 """What it takes, about, to find albedos and to judge a stage."""
@@ -34,13 +38,14 @@ class LaterStages:
     ----------
     names:
         In order; empty where the fit ends with the analysis.
-    raster, path:
+    raster, path, match:
         Settings of the stages; the raster stage's also say how all are judged. None where ``names`` is empty.
     """
 
     names: tuple[str, ...]
     raster: StageSettings | None = None
     path: PathSettings | None = None
+    match: MatchSettings | None = None
     seed: int = 0
     albedo_paths: int = 0
     files: CheckpointFiles | None = None
@@ -59,13 +64,14 @@ class LaterStages:
         names = tuple(name for name in wanted if name != "analysis")
         if not names:
             return cls(())
+        from usdfab.fit.match_stage import checked_match_quality
         from usdfab.fit.path_settings import settings_for
         from usdfab.fit.raster_stage import checked_quality
 
         raster = checked_quality(quality)
-        # The asset has no exposure, and pictures are judged without: the path stage is to do without as well.
+        # The exposure is found before: the path stage is to leave it as it is.
         path = settings_for(quality, seed=seed, gain=False)  # type: ignore[arg-type]
-        return cls(names, raster, path, seed, albedo_paths, files)
+        return cls(names, raster, path, checked_match_quality(quality, seed), seed, albedo_paths, files)
 
     def costs(self) -> dict[str, float]:
         """Seconds that each stage takes, about."""
@@ -74,6 +80,8 @@ class LaterStages:
             if name == "raster" and self.raster is not None:
                 samples = (self.raster.width * self.raster.supersampling) ** 2
                 work = self.raster.iterations * (SECONDS_PER_ITERATION + SECONDS_PER_SAMPLE * samples)
+            elif name == "match" and self.match is not None:
+                work = SECONDS_PER_MATCH_SAMPLE * self.match.pictures * self.match.width**2 * self.match.spp
             elif self.path is not None:
                 work = SECONDS_PER_MILLION_PATHS * self.path.paths + SECONDS_PER_STEP * self.path.iterations
             result[name] = work + JUDGING_SECONDS
@@ -122,8 +130,8 @@ class LaterStages:
         from usdfab.tracer.checkpoint import fingerprint
 
         assert self.path is not None
-        settings = (self.raster, replace(self.path, threads=None)) if name == "path" else (self.raster,)
-        return fingerprint(last.fabric, last.halfway, *settings)
+        own = {"path": replace(self.path, threads=None), "match": self.match}.get(name)
+        return fingerprint(last.fabric, last.halfway, last.exposure, self.raster, own)
 
     def _run(
         self, name: str, last: StageOutcome, shown: FabricParameters, photo: NDArray, rotation: float, course: Course
@@ -131,20 +139,30 @@ class LaterStages:
         assert self.raster is not None and self.path is not None
         if name == "raster":
             before, after = run_raster(
-                last.fabric, shown, photo, rotation, self.raster, seed=self.seed, albedo_paths=self.albedo_paths,
-                checkpoint=self.files.raster if self.files else None, resume=True, progress=course.stage(name),
+                last.fabric, shown, photo, rotation, self.raster, seed=self.seed, exposure=last.exposure,
+                albedo_paths=self.albedo_paths, checkpoint=self.files.raster if self.files else None, resume=True,
+                progress=course.stage(name),
             )  # fmt: skip
             return before.distance, after
+        if name == "match":
+            from usdfab.fit.match_run import run_match
+
+            assert self.match is not None
+            return run_match(
+                last.fabric, photo, rotation, self.match, self.raster, exposure=last.exposure, distance=last.distance,
+                checkpoint=self.files.match if self.files else None, progress=course.stage(name),
+            )  # fmt: skip
         from usdfab.fit.path_run import run_path
 
         return run_path(
-            last.fabric, photo, rotation, self.path, self.raster, halfway=last.halfway, distance=last.distance,
+            last.fabric, photo, rotation, self.path, self.raster, halfway=last.halfway, exposure=last.exposure,
+            distance=last.distance,
             checkpoint=self.files.path if self.files else None, progress=course.stage(name),
         )  # fmt: skip
 
 
 def _interrupted(name: str, last: StageOutcome) -> StageOutcome:
     return StageOutcome(
-        name, last.fabric, 0.0, distance=last.distance, notes=(f"the {name} stage was interrupted: not used",),
-        interrupted=True,
+        name, last.fabric, 0.0, distance=last.distance, exposure=last.exposure,
+        notes=(f"the {name} stage was interrupted: not used",), interrupted=True,
     )  # fmt: skip

@@ -35,6 +35,7 @@ def run_path(
     judge: StageSettings,
     *,
     halfway: FabricParameters | None = None,
+    exposure: float = 1.0,
     distance: float | None = None,
     checkpoint: Path | None = None,
     progress: Progress | None = None,
@@ -51,6 +52,8 @@ def run_path(
         Of the stage, and of the raster stage of the same quality: by its statistics all stages are judged.
     halfway:
         ``StageOutcome.halfway``: the stage starts from it where its picture is closer to the photo.
+    exposure:
+        How many times brighter the photo is than under the rig's standard light, to which albedos belong.
     distance:
         That of ``start``, where it is known.
     checkpoint:
@@ -72,7 +75,7 @@ def run_path(
     steps = settings.iterations + 2
 
     def judged(fabric: FabricParameters) -> float:
-        return stages.traced_distance(fabric, goal, judge, net, settings.seed)
+        return stages.traced_distance(fabric, goal, judge, net, settings.seed, exposure)
 
     say("judging the start of the path stage", 0, steps)
     before = judged(start) if distance is None else distance
@@ -86,7 +89,8 @@ def run_path(
     target = straightened(photo, rotation, fine, scale)
     seen = (target.shape[1] / scale, target.shape[0] / scale)
     result = refine_appearance(
-        begin, target, scene=swatch_scene(begin, rig_for(start.size).with_sample(seen)), settings=settings,
+        begin, target / np.float32(exposure), settings=settings,
+        scene=swatch_scene(begin, rig_for(start.size).with_sample(seen)),
         checkpoint=checkpoint, progress=lambda done, _, loss: say(f"path, loss {loss:.3f}", 1 + done, steps),
         keep_interrupted=True,
     )  # fmt: skip
@@ -100,7 +104,7 @@ def run_path(
         found, unsure = start, {}
     outcome = StageOutcome(
         "path", found, time.perf_counter() - begun, tuple(float(x) for x in result.losses[:, 0]), min(before, after),
-        tuple(notes), result.interrupted, uncertainty=unsure,
+        tuple(notes), result.interrupted, exposure=exposure, uncertainty=unsure,
     )  # fmt: skip
     return before, outcome
 

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 
 from usdfab._version import __version__
 from usdfab.fabric import FabricParameters, Provenance
-from usdfab.fit.albedo import LADDER, PATHS, REFINEMENTS, brightness_curves, with_inverted_albedo
+from usdfab.fit.albedo import (
+    LADDER,
+    PATHS,
+    REFINEMENTS,
+    brightness_curves,
+    dimmed,
+    photo_exposure,
+    with_inverted_albedo,
+)
 from usdfab.fit.analysis import PhotoAnalysis, analyze_photo
 from usdfab.fit.course import Course, Progress
 from usdfab.fit.fit_checkpoint import CheckpointFiles, FitCheckpoint
@@ -30,7 +38,8 @@ class Fit:
     """A fitted fabric, what the photo showed, and what is uncertain.
 
     ``photo`` is the linear picture (H, W, 3); ``size_source`` says where the physical size comes from; ``warnings``
-    are sentences for people; ``stages`` is what each stage found, in order.
+    are sentences for people; ``stages`` is what each stage found, in order. A render of the fabric under the capture
+    rig, times ``exposure``, is as bright as the photo.
     """
 
     fabric: FabricParameters
@@ -39,6 +48,7 @@ class Fit:
     size_source: str
     warnings: tuple[str, ...]
     stages: tuple[StageOutcome, ...] = ()
+    exposure: float = 1.0
 
 
 def fit_photo(
@@ -109,8 +119,10 @@ def fit_photo(
             0, f"nothing says how large the photo is: its width is taken as {DEFAULT_WIDTH * 1e3:g} mm; use --size"
         )
     outcomes = later.run(first, shown, photo.pixels, analysis.rotation, kept, course)
+    exposure = outcomes[-1].exposure
     warnings += dict.fromkeys(note for outcome in outcomes for note in outcome.notes)
-    notes = [f"size from {photo.size_source}", *photo.notes, *_confidences(analysis), *warnings, *prior_notes]
+    light = f"the photo is {exposure:.2f} times as bright as under the rig's standard light"
+    notes = [f"size from {photo.size_source}", light, *photo.notes, *_confidences(analysis), *warnings, *prior_notes]
     provenance = Provenance(
         source=Path(path).name,
         source_sha256=photo.sha256,
@@ -119,7 +131,7 @@ def fit_photo(
         notes=tuple(notes),
     )
     fabric = replace(outcomes[-1].fabric, provenance=provenance)
-    return Fit(fabric, analysis, photo.pixels, photo.size_source, (*photo.notes, *warnings), outcomes)
+    return Fit(fabric, analysis, photo.pixels, photo.size_source, (*photo.notes, *warnings), outcomes, exposure)
 
 
 def _analysed(
@@ -131,10 +143,12 @@ def _analysed(
     say("analysing", 1, steps)
     analysis = analyze_photo(photo.pixels.astype(np.float64), str(path))
     shown, prior_notes = fabric_from_analysis(analysis, photo.width, seed, _prim_name(Path(path).stem))
-    kept.photo = analysis, shown, prior_notes
     curves = brightness_curves(
         shown, albedo_paths, seed=seed, progress=lambda done, _: say("measuring albedo", 2 + done, steps)
     )
+    exposure = photo_exposure(shown, curves)
+    shown = dimmed(shown, exposure)
+    kept.photo = analysis, shown, prior_notes
     fabric, notes = with_inverted_albedo(
         shown,
         curves,
@@ -142,7 +156,7 @@ def _analysed(
         seed=seed,
         progress=lambda done, _: say("measuring albedo", 2 + ladder + done, steps),
     )
-    return StageOutcome("analysis", fabric, time.perf_counter() - begun, notes=tuple(notes))
+    return StageOutcome("analysis", fabric, time.perf_counter() - begun, notes=tuple(notes), exposure=exposure)
 
 
 def _confidences(analysis: PhotoAnalysis) -> list[str]:

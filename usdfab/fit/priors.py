@@ -34,6 +34,9 @@ MIN_CONFIDENCE = 0.3
 MAX_REPEAT_CELLS = 1600
 """A yarn-dyed repeat that needs more crossings than this is left to its mean colour."""
 
+VARIED_CELLS = 256
+"""Crossings of all variants of the repeat together beyond which a yarn-dyed fabric gets fewer variants."""
+
 
 def fabric_from_analysis(
     analysis: PhotoAnalysis, width: float, seed: int = 0, name: str = "Fabric"
@@ -115,5 +118,6 @@ def _with_yarn_colors(fabric: FabricParameters, analysis: PhotoAnalysis) -> tupl
         if picks * ends > MAX_REPEAT_CELLS:
             notes.append(f"the {this}'s colour sequence needs a repeat of {picks} x {ends}; its mean colour is used")
         else:
-            fabric = dyed
+            # A long repeat needs no variants against repetition, and each costs as much memory as the repeat.
+            fabric = replace(dyed, variants=max(1, min(dyed.variants, VARIED_CELLS // (picks * ends))))
     return fabric, tuple(notes)

@@ -42,6 +42,7 @@ def write_report(
 ) -> dict[str, Path]:
     """Write ``report.html`` into ``folder``, a page that needs nothing else, and its pictures as PNG beside it.
 
+    Swatches are as bright as the photo (``fit.exposure``).
     These are ``photo``, ``swatch``, ``comparison`` (photo, then a swatch for each stage), ``difference`` (fit minus
     photo), ``drape``; after several stages ``after_STAGE`` for each but the last, and for a stage with iterations
     ``STAGE_loss``.
@@ -93,7 +94,8 @@ def write_report(
             scene.cameras[0], settings, lambda done, total, within=within: within("", done, total)  # type: ignore[misc]
         )  # fmt: skip
         course.finish(name)
-        pictures[name] = denoise(render.pixels, render.albedo, render.normal) if denoised else render.pixels
+        clean = denoise(render.pixels, render.albedo, render.normal) if denoised else render.pixels
+        pictures[name] = clean if name == "drape" else np.float32(fit.exposure) * clean
     pictures["comparison"] = side_by_side([pictures["photo"], *(pictures[name] for name in shown)])
     scale = photo.shape[1] / fit.fabric.size[0]
     upright = straightened(fit.photo, fit.analysis.rotation, fit.photo.shape[1] / fit.fabric.size[0], scale)

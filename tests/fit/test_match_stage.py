@@ -1,0 +1,221 @@
+"""The match stage: its coordinates, its steps, and a small match from the tracer's own pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+from small_network import small_net
+
+from usdfab.errors import UsdfabError
+from usdfab.fabric import FabricParameters, YarnParameters, weave_from_name
+from usdfab.fit import features, match_stage
+from usdfab.fit.features import FeatureNet
+from usdfab.fit.match_run import run_match
+from usdfab.fit.match_space import EXPOSURE, MOVES, MatchSpace, Move
+from usdfab.fit.match_stage import MatchResult, MatchSettings, checked_match_quality, match_photo
+from usdfab.fit.match_steps import SOFT, broyden_update, damped_step, normal_equations, soft_l1
+from usdfab.fit.raster_stage import StageSettings
+from usdfab.imaging import denoise
+from usdfab.tracer import RenderSettings, Tracer
+from usdfab.usd.rig import swatch_scene
+
+YARN = YarnParameters(count=3, radius=3e-4, fiber_count=6, albedo=(0.6, 0.4, 0.3), roughness_azimuthal=0.3)
+CLOTH = FabricParameters(weave_from_name("plain"), (2e-3, 2e-3), YARN, replace(YARN, albedo=(0.3, 0.5, 0.7)))
+SMALL = MatchSettings(width=32, spp=16, iterations=2, steps=3, levels=(1,), free=("albedo",), prior=1e-4)
+
+
+@pytest.fixture(scope="module")
+def net(tmp_path_factory: pytest.TempPathFactory) -> FeatureNet:
+    return small_net(tmp_path_factory.mktemp("net"), features.fast_dtype())
+
+
+@pytest.fixture(scope="module")
+def goal() -> np.ndarray:
+    scene = swatch_scene(CLOTH)
+    render = Tracer(scene).render(scene.cameras[0], RenderSettings((32, 32), spp=64, seed=9))
+    return 1.2 * denoise(render.pixels, render.albedo, render.normal)
+
+
+def wrong() -> FabricParameters:
+    return replace(CLOTH, warp=replace(CLOTH.warp, albedo=(0.3, 0.4, 0.5)), weft=replace(CLOTH.weft, albedo=(0.5,) * 3))
+
+
+# --- coordinates ---
+
+
+@pytest.mark.parametrize("name", MOVES)
+@given(part=st.floats(0.02, 0.98), steps=st.floats(-4.0, 4.0))
+def test_moves_are_monotone_and_stay_in_range(name: str, part: float, steps: float) -> None:
+    move = MOVES[name]
+    value = move.low + part * (move.high - move.low)
+    assert move.moved(value, 0.0) == value
+    there = move.moved(value, steps)
+    assert move.low <= there <= move.high
+    assert (there - value) * np.sign(steps) >= -1e-12 * move.high
+    assert move.moved(value, steps + 0.5) >= there
+    inside = move.low < there < move.high
+    if inside:
+        assert move.moved(there, -steps) == pytest.approx(value, rel=1e-6)
+
+
+def test_a_value_outside_the_range_stays_until_it_moves_inwards() -> None:
+    move = Move("log", 0.1, 1.0, 2.0)
+    assert move.moved(3.0, 0.0) == 3.0
+    assert move.moved(3.0, 2.0) == 3.0
+    assert move.moved(3.0, -1.0) == pytest.approx(3.0 * np.exp(-0.1))
+
+
+def test_a_point_moves_the_numbers_it_names() -> None:
+    cloth = replace(CLOTH, weft=replace(CLOTH.weft, yarn_albedo=((0.1,) * 3, (0.9,) * 3)))
+    space = MatchSpace.about(cloth, light=1.5)
+    zero = np.zeros(len(space.names))
+    assert space.fabric(zero) == cloth
+    assert space.exposure(zero) == 1.5
+    point = zero.copy()
+    point[space.names.index("warp.crimp")] = 1.0
+    point[space.names.index("weft.albedo.g")] = -1.0
+    point[space.names.index("weft.flyaway_density")] = 2.0
+    moved = space.fabric(point)
+    assert moved.warp == replace(cloth.warp, crimp=cloth.warp.crimp * np.exp(MOVES["crimp"].step))
+    assert moved.weft.flyaway_density == pytest.approx(1600.0)
+    for before, after in zip(cloth.weft.colors(), moved.weft.colors(), strict=True):
+        assert (after[0], after[2]) == (before[0], before[2])
+        # Odds fall by the same factor for each colour of the system.
+        odds = [c / (1.0 - c) for c in (before[1], after[1])]
+        assert odds[1] / odds[0] == pytest.approx(np.exp(-MOVES["albedo"].step))
+    with pytest.raises(UsdfabError, match="moves no 'colour'"):
+        MatchSpace.about(cloth, ("colour",))
+
+
+def test_deviations_are_in_the_parameters_own_units() -> None:
+    space = MatchSpace.about(CLOTH, ("crimp", "albedo", EXPOSURE))
+    found = space.deviations(np.zeros(len(space.names)), np.full(len(space.names), 0.1))
+    assert EXPOSURE not in found
+    assert found["warp.crimp"] == pytest.approx(CLOTH.warp.crimp * MOVES["crimp"].step * 0.1, rel=1e-3)
+    c = CLOTH.warp.albedo[0]
+    assert found["warp.albedo[r]"] == pytest.approx(c * (1 - c) * MOVES["albedo"].step * 0.1, rel=1e-3)
+
+
+# --- steps ---
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_quadratic_touches_the_sum_of_absolute_values_and_lies_above_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    r0 = rng.normal(0, 1, 40).astype(np.float32)
+    jacobian = rng.normal(0, 1, (3, 40)).astype(np.float32)
+    weights = rng.uniform(0, 1, 40).astype(np.float32)
+    matrix, gradient = normal_equations(r0, jacobian, weights)
+    for x in (rng.normal(0, 1, 3), rng.normal(0, 1e-3, 3)):
+        moved = soft_l1(r0 + x.astype(np.float32) @ jacobian, weights)
+        above = soft_l1(r0, weights) + gradient @ x + 0.5 * x @ matrix @ x
+        assert moved <= above + 1e-4
+    # The tangent: half a central difference.
+    h = 1e-2
+    for k in range(3):
+        up, down = (soft_l1(r0 + s * h * jacobian[k], weights) for s in (1, -1))
+        curvature = (jacobian[k].astype(float) ** 2 * weights).sum() / SOFT * h
+        assert (up - down) / (2 * h) == pytest.approx(gradient[k], abs=curvature + 1e-3)
+
+
+def test_a_step_solves_the_least_squares_with_its_prior_and_is_no_longer_than_allowed() -> None:
+    matrix, gradient = np.diag([2.0, 4.0]), np.array([-2.0, 8.0])
+    free = damped_step(matrix, gradient, np.zeros(2), np.full(2, 1e6), 1.0, 0.0, 10.0)
+    assert free == pytest.approx([1.0, -2.0])
+    held = damped_step(matrix, gradient, np.array([1.0, 0.0]), np.array([1.0, 1.0]), 2.0, 0.0, 10.0)
+    assert held == pytest.approx([0.0, -8.0 / 6.0])
+    assert np.abs(damped_step(matrix, gradient, np.zeros(2), np.full(2, 1e6), 1.0, 0.0, 0.5)).max() == 0.5
+    assert np.linalg.norm(damped_step(matrix, gradient, np.zeros(2), np.full(2, 1e6), 1.0, 10.0, 9.0)) < 0.5
+
+
+def test_broyden_learns_what_a_step_showed_and_keeps_the_rest() -> None:
+    rng = np.random.default_rng(0)
+    jacobian = rng.normal(0, 1, (3, 20)).astype(np.float32)
+    before, step = jacobian.copy(), np.array([1.0, 0.0, -2.0])
+    change = rng.normal(0, 1, 20).astype(np.float32)
+    broyden_update(jacobian, step, change)
+    assert step @ jacobian == pytest.approx(change, abs=1e-5)
+    across = np.array([2.0, 3.0, 1.0])
+    assert across @ jacobian == pytest.approx(across @ before, abs=1e-5)
+
+
+# --- the stage ---
+
+
+@pytest.fixture(scope="module")
+def matched(net: FeatureNet, goal: np.ndarray) -> MatchResult:
+    return match_photo(wrong(), goal, SMALL, net=net, exposure=1.2)
+
+
+def test_colours_are_found_from_a_picture(matched: MatchResult) -> None:
+    assert list(matched.losses) == sorted(matched.losses, reverse=True)
+    assert matched.losses[-1] < 0.4 * matched.losses[0]
+    assert not matched.interrupted
+    for system in ("warp", "weft"):
+        truth, start, found = (np.array(f.system(system).albedo) for f in (CLOTH, wrong(), matched.fabric))  # type: ignore[arg-type]
+        assert np.abs(found - truth).mean() < 0.6 * np.abs(start - truth).mean()
+    assert set(matched.uncertainty) == {f"{s}.albedo[{c}]" for s in ("warp", "weft") for c in "rgb"}
+    assert matched.fabric.warp.radius == CLOTH.warp.radius
+
+
+def test_a_broken_off_match_goes_on_to_the_same_result(
+    matched: MatchResult, net: FeatureNet, goal: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = tmp_path / "state.npz"
+    whole = match_stage._Search.round
+
+    def break_off(search: match_stage._Search) -> None:
+        if search.state.round == 1:
+            raise RuntimeError("killed")
+        whole(search)
+
+    monkeypatch.setattr(match_stage._Search, "round", break_off)
+    with pytest.raises(RuntimeError):
+        match_photo(wrong(), goal, SMALL, net=net, exposure=1.2, checkpoint=state)
+    monkeypatch.setattr(match_stage._Search, "round", whole)
+    again = match_photo(wrong(), goal, SMALL, net=net, exposure=1.2, checkpoint=state)
+    assert again.fabric == matched.fabric
+    assert again.losses == matched.losses
+    with pytest.raises(UsdfabError, match="another"):
+        match_photo(CLOTH, goal, SMALL, net=net, exposure=1.2, checkpoint=state)
+    state.write_bytes(b"no state")
+    with pytest.raises(UsdfabError, match="damaged"):
+        match_photo(wrong(), goal, SMALL, net=net, exposure=1.2, checkpoint=state)
+
+
+def test_ctrl_c_keeps_the_best_so_far(
+    net: FeatureNet, goal: np.ndarray, monkeypatch: pytest.MonkeyPatch, matched: MatchResult
+) -> None:
+    def stop(done: int, _: int, loss: float) -> None:
+        if loss < 0.9 * matched.losses[0]:
+            raise KeyboardInterrupt
+
+    result = match_photo(wrong(), goal, SMALL, net=net, exposure=1.2, progress=stop)
+    assert result.interrupted
+
+
+@pytest.mark.parametrize("closer", [True, False])
+def test_the_stage_is_used_only_where_it_comes_closer(
+    net: FeatureNet, goal: np.ndarray, monkeypatch: pytest.MonkeyPatch, closer: bool
+) -> None:
+    result = MatchResult(replace(CLOTH, name="Matched"), 1.4, (1.0, 0.5), {"warp.crimp": 0.1}, False)
+    monkeypatch.setattr(features, "load_features", lambda *_, **__: net)
+    monkeypatch.setattr(match_stage, "match_photo", lambda *_, **__: result)
+    monkeypatch.setattr("usdfab.fit.stages.traced_distance", lambda *_: 0.3 if closer else 0.9)
+    judge = StageSettings(width=32, supersampling=1, iterations=1, levels=(1,))
+    before, outcome = run_match(wrong(), goal, 0.0, SMALL, judge, exposure=1.2, distance=0.5)
+    assert before == 0.5
+    assert outcome.distance == pytest.approx(0.3 if closer else 0.5)
+    assert (outcome.fabric.name, outcome.exposure) == (("Matched", 1.4) if closer else (wrong().name, 1.2))
+    assert bool(outcome.uncertainty) == closer
+    assert any("did not come closer" in note for note in outcome.notes) != closer
+
+
+def test_an_unknown_quality_is_refused() -> None:
+    with pytest.raises(UsdfabError, match="no quality 'best'"):
+        checked_match_quality("best")
+    assert checked_match_quality("draft", 7).seed == 7

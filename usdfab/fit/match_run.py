@@ -1,0 +1,92 @@
+"""The match stage as the pipeline runs it: on a turned photo, judged against what was."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from numpy.typing import NDArray
+
+from usdfab.fabric import FabricParameters
+from usdfab.fit import stages
+from usdfab.fit.stages import StageOutcome
+from usdfab.fit.straighten import straightened
+from usdfab.imaging import check_denoiser
+
+if TYPE_CHECKING:
+    from usdfab.fit.match_stage import MatchSettings
+    from usdfab.fit.raster_stage import StageSettings
+
+Progress = Callable[[str, int, int], None]
+
+
+def run_match(
+    start: FabricParameters,
+    photo: NDArray,
+    rotation: float,
+    settings: MatchSettings,
+    judge: StageSettings,
+    *,
+    exposure: float = 1.0,
+    distance: float | None = None,
+    checkpoint: Path | None = None,
+    progress: Progress | None = None,
+) -> tuple[float, StageOutcome]:
+    """The match stage on a photo, judged against its start.
+
+    Parameters
+    ----------
+    start:
+        The best fabric so far.
+    photo, rotation:
+        (H, W, 3) linear, its whole width ``start.size[0]``; turn of the cloth in it, radians.
+    settings, judge:
+        Of the stage, and of the raster stage of the same quality: by its statistics all stages are judged.
+    exposure:
+        How many times brighter the photo is than the start under the rig's standard light.
+    distance:
+        That of ``start``, where it is known.
+    checkpoint:
+        As ``match_stage.match_photo``.
+
+    Returns
+    -------
+    distance, outcome:
+        Of ``start``. ``outcome.fabric`` and ``outcome.exposure`` are the better of the two by the distance of the
+        path-traced picture; a note says so where that is the start.
+    """
+    from usdfab.fit.features import fast_dtype, load_features
+    from usdfab.fit.match_stage import match_photo
+
+    check_denoiser()
+    say = progress or (lambda *_: None)
+    begun = time.perf_counter()
+    net = load_features(dtype=fast_dtype())
+    fine = photo.shape[1] / start.size[0]
+    goal, judged = (straightened(photo, rotation, fine, s.width / start.size[0]) for s in (settings, judge))
+    steps = settings.pictures + 2
+    say("judging the start of the match stage", 0, steps)
+    before = distance
+    if before is None:
+        before = stages.traced_distance(start, judged, judge, net, settings.seed, exposure)
+    result = match_photo(
+        start, goal, settings, net=net, exposure=exposure, checkpoint=checkpoint,
+        progress=lambda done, _, loss: say(f"match, loss {loss:.3f}", done, steps),
+    )  # fmt: skip
+    notes = []
+    if result.interrupted:
+        notes.append(f"the match stage was interrupted after {len(result.losses) - 1} steps")
+    say("judging the match stage", steps - 1, steps)
+    # Other draws than those that were matched.
+    after = stages.traced_distance(result.fabric, judged, judge, net, settings.seed + 1, result.exposure)
+    found, light, unsure = result.fabric, result.exposure, result.uncertainty
+    if not after < before:
+        notes.append(f"the match stage did not come closer to the photo ({before:.3f}, then {after:.3f}): not used")
+        found, light, unsure = start, exposure, {}
+    outcome = StageOutcome(
+        "match", found, time.perf_counter() - begun, result.losses, min(before, after), tuple(notes),
+        result.interrupted, exposure=light, uncertainty=unsure,
+    )  # fmt: skip
+    return before, outcome
