@@ -74,7 +74,7 @@ class MatchSettings:
     """
 
     width: int = 240
-    spp: int = 6
+    spp: int = 4
     iterations: int = 2
     steps: int = 3
     levels: tuple[int, ...] = (1, 2, 4)
