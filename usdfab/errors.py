@@ -1,4 +1,4 @@
-"""The one exception that users see: where, what was wrong, what to do."""
+"""The exceptions that users see: where, what was wrong, what to do."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from __future__ import annotations
 class UsdfabError(ValueError):
     """Bad input or an impossible request, told to a person.
 
-    The command line prints it as one line and ends with exit code 2. Our own bugs are asserts, never this.
+    The command line prints it as one line and ends with ``exit_code``. Our own bugs are asserts, never this.
 
     Parameters
     ----------
@@ -18,6 +18,8 @@ class UsdfabError(ValueError):
         What to do about it; empty where the problem says it all.
     """
 
+    exit_code = 2
+
     def __init__(self, problem: str, *, place: str = "", remedy: str = "") -> None:
         self.problem = problem
         self.place = place
@@ -26,3 +28,9 @@ class UsdfabError(ValueError):
         if remedy:
             text = f"{text}; {remedy}"
         super().__init__(text)
+
+
+class NoFabricError(UsdfabError):
+    """A photo that can be read but shows no woven fabric that could be measured."""
+
+    exit_code = 3

@@ -8,11 +8,12 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from usdfab.fit import pipeline, raster_stage
 from usdfab.fit.raster_stage import StageSettings
-from usdfab.imaging import read_image
+from usdfab.imaging import read_image, write_image
 from usdfab.usd.fabric_io import read_fabric
 
 PHOTO = Path(__file__).parents[2] / "samples" / "microscope.png"
@@ -68,6 +69,23 @@ def test_a_killed_stage_leaves_its_state_and_is_resumed(
     assert code == 0, err
     assert broken.read_text() == whole.read_text()
     assert not (tmp_path / "broken.usda.raster.safetensors").exists()
+
+
+def test_no_fabric_has_an_exit_code_of_its_own(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "fit_photo", partial(pipeline.fit_photo, albedo_paths=200))
+    photo, output = tmp_path / "wall.png", tmp_path / "x.usda"
+    write_image(photo, np.full((80, 90, 3), 0.4))
+    command = ("fit", photo, "-o", output, "--size", "3mm")
+    code, out, err = run(*command, "--json")
+    assert code == 3
+    assert not out and len(err.strip().splitlines()) == 1
+    assert "no contrast" in err
+    assert [p.name for p in tmp_path.iterdir()] == ["wall.png"]
+    code, out, err = run(*command, "--json", "--force")
+    assert code == 0, err
+    assert "warning: Forced: the photo has no contrast" in err
+    assert any("no contrast" in note for note in read_fabric(output).provenance.notes)
+    assert json.loads(out)["analysis"]["lattice_confidence"] == 0.0
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def pretended(monkeypatch: pytest.MonkeyPatch, small: None) -> Iterator[dict[str
     """Stages that change one number each; how often each ran. Albedos are what the photo shows."""
     ran = {"analysis": 0, "raster": 0, "path": 0}
 
-    def analysed(pixels: np.ndarray, place: str) -> PhotoAnalysis:
+    def analysed(pixels: np.ndarray, place: str, **_: object) -> PhotoAnalysis:
         ran["analysis"] += 1
         return real_analysis()
 
@@ -279,7 +279,7 @@ def test_killed_in_any_stage(
     files = CheckpointFiles(tmp_path / "out.usda")
     assert files.fit.exists() == (when != "measuring albedo")
     if files.fit.exists():
-        monkeypatch.setattr(pipeline, "analyze_photo", lambda *_: pytest.fail("the analysis is finished"))
+        monkeypatch.setattr(pipeline, "analyze_photo", lambda *_, **__: pytest.fail("the analysis is finished"))
     again = fitted(photo, checkpoint=files, resume=True)
     assert again.fabric == undisturbed.fabric
     assert again.warnings == undisturbed.warnings

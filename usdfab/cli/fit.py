@@ -49,6 +49,9 @@ def run(
     resume: Annotated[
         bool, Parameter(negative="", help="Go on from what an unfinished fit left beside OUTPUT.")
     ] = False,
+    force: Annotated[
+        bool, Parameter(negative="", help="Go on where no woven fabric is found in the photo, with a warning.")
+    ] = False,
     report: Annotated[Path | None, Parameter(help="Folder for a page, report.html, and its pictures.")] = None,
     report_spp: Annotated[int, Parameter(help="Samples per pixel of the report's pictures.")] = 24,
     denoise: Denoise = False,
@@ -61,16 +64,17 @@ def run(
 
     The analysis stage reads counts, weave, colours, widths and twist from the photo; fiber parameters it cannot see
     are priors, and what is uncertain is said. The raster stage then moves shape and appearance until a rasterized
-    picture resembles the photo, the path stage colours and roughnesses until a path-traced one does; each is used only
-    where it comes closer. Ctrl-C ends them early with the best so far. What is finished is kept beside OUTPUT until
-    the fit is done; after a break --resume goes on from there, to the same result.
+    picture resembles the photo, the match stage shape, appearance and exposure until a path-traced one does, the path
+    stage colours and roughnesses by gradients of the path tracer; each is used only where it comes closer. Ctrl-C ends them early with the best so far. What is finished is kept beside OUTPUT until
+    the fit is done; after a break --resume goes on from there, to the same result. A photo that shows no woven fabric
+    ends with exit code 3 and what was measured; nothing is written then, unless --force is given.
 
     Usage examples:
 
         usdfab fit photo.png -o fabric.usda --size 3.6mm
         usdfab fit photo.tif -o fabric.usda --pixel-size 7.5um --report report --json
         usdfab fit photo.png -o fabric.usda --size 3.6mm --crop 100,100,900,700
-        usdfab fit photo.png -o fabric.usda --size 3.6mm --stages analysis,raster,path --quality standard
+        usdfab fit photo.png -o fabric.usda --size 3.6mm --stages analysis,match --quality standard
         usdfab fit photo.png -o fabric.usda --size 3.6mm --stages analysis,raster,path --quality standard --resume
 
     Parameters
@@ -116,6 +120,7 @@ def run(
             crop=region.pixels if region else None,
             checkpoint=files,
             resume=resume,
+            force=force,
         )
     write_fabric(fit.fabric, output, overwrite=overwrite)
     stopped = next((stage.name for stage in fit.stages if stage.interrupted), None)
@@ -186,6 +191,7 @@ def _analysis(fit: Fit) -> dict[str, Any]:
         "gap_cover": seen.gap_cover,
         "gap_confidence": seen.gap_confidence,
         "size_source": fit.size_source,
+        "doubts": [doubt.as_table() for doubt in fit.doubts],
         "warnings": list(fit.warnings),
     }
     for name, system in (("warp", seen.warp), ("weft", seen.weft)):

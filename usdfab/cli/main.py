@@ -1,7 +1,7 @@
 """The ``usdfab`` command: one module per sub-command, loaded when it runs.
 
-Exit codes: 0 done; 1 the check found warnings (--strict); 2 bad input or usage, or the check found errors; 130
-interrupted.
+Exit codes: 0 done; 1 the check found warnings (--strict); 2 bad input or usage, or the check found errors; 3 no
+fabric found in the photo; 130 interrupted.
 Results go to stdout, talk goes to stderr.
 """
 
@@ -82,7 +82,7 @@ def _run(arguments: list[str]) -> int:
         return result if isinstance(result, int) else 0
     except UsdfabError as error:
         print(f"usdfab: {' '.join(str(error).split())}", file=sys.stderr)
-        return USAGE_ERROR
+        return error.exit_code
     except CycloptsError as error:
         print(f"usdfab: {' '.join(str(error).split())}; see usdfab --help", file=sys.stderr)
         return USAGE_ERROR

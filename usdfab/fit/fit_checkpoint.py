@@ -205,6 +205,7 @@ def _analysis(table: dict[str, Any]) -> PhotoAnalysis:
         system["colour"] = system["colour"].reshape(3)
         values[name] = YarnSystem(**system)
     values["warnings"] = tuple(values["warnings"])
+    values["detail"] = None if values["detail"] is None else tuple(values["detail"])
     return PhotoAnalysis(**values)
 
 

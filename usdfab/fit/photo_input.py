@@ -20,6 +20,9 @@ DEFAULT_WIDTH = 5e-3
 WORKING_SIDE = 1024
 """A photo whose shorter side is at least twice as long is averaged down; no stage looks at more pixels than 720."""
 
+TOP = 0.98
+"""Linear value from which a pixel counts as clipped: 253 of 255; cameras stop a little below the end."""
+
 MOST_ASPECT = 4.0
 """Of longer photos the middle is taken: a lattice needs yarns both ways."""
 
@@ -95,7 +98,7 @@ def load_photo(
         notes.append(f"cropped to {x1 - x0} x {y1 - y0} of {columns} x {rows} pixels")
     pixels, note = _middle(pixels)
     notes += note
-    clipped = (float((pixels.max(axis=2) >= 0.999).mean()), float((pixels.max(axis=2) <= 1e-6).mean()))
+    clipped = (float((pixels.max(axis=2) >= TOP).mean()), float((pixels.max(axis=2) <= 1e-6).mean()))
     factor = max(1, min(pixels.shape[:2]) // WORKING_SIDE)
     if factor > 1:
         notes.append(f"averaged over {factor} x {factor} pixels, from {pixels.shape[1]} x {pixels.shape[0]}")

@@ -23,6 +23,7 @@ from usdfab.fit.albedo import (
 )
 from usdfab.fit.analysis import PhotoAnalysis, analyze_photo
 from usdfab.fit.course import Course, Progress
+from usdfab.fit.doubts import Doubt, find_doubts
 from usdfab.fit.fit_checkpoint import CheckpointFiles, FitCheckpoint
 from usdfab.fit.later_stages import LaterStages
 from usdfab.fit.photo_input import DEFAULT_WIDTH as DEFAULT_WIDTH, Crop, Photo, load_photo
@@ -38,8 +39,9 @@ class Fit:
     """A fitted fabric, what the photo showed, and what is uncertain.
 
     ``photo`` is the linear picture (H, W, 3); ``size_source`` says where the physical size comes from; ``warnings``
-    are sentences for people; ``stages`` is what each stage found, in order. A render of the fabric under the capture
-    rig, times ``exposure``, is as bright as the photo.
+    are sentences for people; ``stages`` is what each stage found, in order; ``doubts`` are what in the photo makes the
+    fit unsure, and about which parameters. A render of the fabric under the capture rig, times ``exposure``, is as
+    bright as the photo.
     """
 
     fabric: FabricParameters
@@ -48,6 +50,7 @@ class Fit:
     size_source: str
     warnings: tuple[str, ...]
     stages: tuple[StageOutcome, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
     exposure: float = 1.0
 
 
@@ -64,6 +67,7 @@ def fit_photo(
     crop: Crop | None = None,
     checkpoint: CheckpointFiles | None = None,
     resume: bool = False,
+    force: bool = False,
 ) -> Fit:
     """Estimate a fabric from one photo.
 
@@ -88,11 +92,15 @@ def fit_photo(
         Files in which finished stages are kept, and those at work every few iterations; and whether to go on from
         them, to the same result as without the break. They are left there at the end. Ctrl-C in a stage after the
         analysis ends the fit with the best so far, and that stage is marked as interrupted.
+    force:
+        Go on where the photo shows no woven cloth, with a warning.
 
     Raises
     ------
+    NoFabricError
+        If the photo shows no woven cloth.
     UsdfabError
-        For a file that is no image, too small, or shows no woven cloth; for stages and qualities that there are not;
+        For a file that is no image or too small; for stages and qualities that there are not;
         for a checkpoint of another fit.
     """
     wanted = checked_stages(stages)
@@ -102,18 +110,19 @@ def fit_photo(
         checkpoint.remove()
     about = {
         "photo": photo.sha256, "size": photo.width, "crop": photo.box, "seed": seed, "paths": albedo_paths,
-        "version": __version__,
+        "force": force, "version": __version__,
     }  # fmt: skip
     kept = FitCheckpoint.begin(checkpoint.fit if checkpoint else None, about, resume)
     first = kept.finished(0, "analysis", "")
     course = Course(progress, ({} if first else {"analysis": ANALYSIS_SECONDS}) | later.costs())
     if first is None:
-        first = _analysed(photo, path, seed, albedo_paths, kept, course.stage("analysis"))
+        first = _analysed(photo, path, seed, albedo_paths, force, kept, course.stage("analysis"))
         kept.add("", first)
     course.finish("analysis")
     assert kept.photo is not None
     analysis, shown, prior_notes = kept.photo
-    warnings = list(analysis.warnings)
+    doubts = find_doubts(photo, analysis)
+    warnings = [*analysis.warnings, *(doubt.warning for doubt in doubts)]
     if photo.size_source == "default":
         warnings.insert(
             0, f"nothing says how large the photo is: its width is taken as {DEFAULT_WIDTH * 1e3:g} mm; use --size"
@@ -131,17 +140,18 @@ def fit_photo(
         notes=tuple(notes),
     )
     fabric = replace(outcomes[-1].fabric, provenance=provenance)
-    return Fit(fabric, analysis, photo.pixels, photo.size_source, (*photo.notes, *warnings), outcomes, exposure)
+    warnings = [*photo.notes, *warnings]
+    return Fit(fabric, analysis, photo.pixels, photo.size_source, tuple(warnings), outcomes, doubts, exposure)
 
 
 def _analysed(
-    photo: Photo, path: str | Path, seed: int, albedo_paths: int, kept: FitCheckpoint, say: Progress
+    photo: Photo, path: str | Path, seed: int, albedo_paths: int, force: bool, kept: FitCheckpoint, say: Progress
 ) -> StageOutcome:
     """The first stage. What the photo showed goes into ``kept``."""
     begun = time.perf_counter()
     ladder, steps = len(LADDER), 2 + len(LADDER) + REFINEMENTS
     say("analysing", 1, steps)
-    analysis = analyze_photo(photo.pixels.astype(np.float64), str(path))
+    analysis = analyze_photo(photo.pixels.astype(np.float64), str(path), force=force)
     shown, prior_notes = fabric_from_analysis(analysis, photo.width, seed, _prim_name(Path(path).stem))
     curves = brightness_curves(
         shown, albedo_paths, seed=seed, progress=lambda done, _: say("measuring albedo", 2 + done, steps)

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from usdfab.errors import UsdfabError
+from usdfab.errors import NoFabricError, UsdfabError
 from usdfab.fabric.weave import Weave
-from usdfab.fit.analysis.agreement import fold_agreement
+from usdfab.fit.analysis.assumed import assumed_analysis
 from usdfab.fit.analysis.choose import Hypothesis, rank_hypotheses
-from usdfab.fit.analysis.features import Array, Features, extract
+from usdfab.fit.analysis.evidence import LEAST_LATTICE, fine_slope, lattice_evidence
+from usdfab.fit.analysis.features import Array, extract
 from usdfab.fit.analysis.rectify import STEP, Phase
 from usdfab.fit.analysis.result import PhotoAnalysis, YarnSystem
 from usdfab.fit.analysis.yarns import Blocks, colour_sequence, cut, gap_mask, twist, widths, yarn_colours
@@ -21,13 +22,13 @@ LEAST_PIXELS = 64
 """Smallest side of a photo that is looked at."""
 SIDE = (256, 560)
 """The shorter side is brought into this range of pixels; spacings are reported in pixels of the photo as given."""
-LEAST_LATTICE = 0.15
-"""Lattice confidence below which a photo is refused."""
+LEAST_CONTRAST = 1e-3
+"""Between the brightest and the darkest hundredth of the pixels, linear."""
 CLEAR = 10.0
 """Nats of lead over the next different answer that count as clear."""
 
 
-def analyze_photo(linear: ArrayLike, place: str = "photo") -> PhotoAnalysis:
+def analyze_photo(linear: ArrayLike, place: str = "photo", *, force: bool = False) -> PhotoAnalysis:
     """Estimate yarn counts, weave, colours, widths, gaps and twist of the woven cloth on one photo.
 
     Use it on a photo taken square to the cloth, yarns within about 15 degrees of the image axes, showing 3 to about 45
@@ -39,24 +40,47 @@ def analyze_photo(linear: ArrayLike, place: str = "photo") -> PhotoAnalysis:
         Linear RGB in [0, 1], row 0 at the top. Values outside are clipped.
     place:
         What to call the photo in an error, usually its file name.
+    force:
+        Where no fabric is found, go on with the best guess and a warning that says so.
 
     Raises
     ------
+    NoFabricError
+        If the photo has no contrast, or shows no woven lattice.
     UsdfabError
-        If the array is no RGB photo, is smaller than 64 pixels, has no contrast, or shows no woven lattice.
+        If the array is no RGB photo, or smaller than 64 pixels.
     """
     photo = _checked(linear, place)
+    light = photo.mean(2)
+    contrast = float(np.quantile(light, 0.99) - np.quantile(light, 0.01))
+    if contrast < LEAST_CONTRAST:
+        problem = (
+            f"the photo has no contrast (all black, all white or one colour): {contrast:.1g} of {LEAST_CONTRAST:g}"
+        )
+        if force:
+            return assumed_analysis(photo, _forced(problem))
+        raise NoFabricError(problem, place=place, remedy="check exposure and focus")
     scale = _working_scale(photo.shape)
     working = _resized(photo, scale)
     features = extract(working)
     ranked = rank_hypotheses(features)
-    confidence = lattice_confidence(features, ranked)
+    evidence = lattice_evidence(features, ranked[0]) if ranked else None
+    confidence = evidence.confidence if evidence else 0.0
+    warnings: tuple[str, ...] = ()
     if confidence < LEAST_LATTICE:
-        raise UsdfabError(
-            "no woven lattice found: nothing repeats in two directions the way crossing yarns do",
-            place=place,
-            remedy="take a sharp photo square to the cloth that shows 5 to 40 yarns each way",
-        )
+        problem = evidence.problem() if evidence else (
+            "no woven lattice found: no spacing repeats across and down (fine detail has "
+            f"{10 ** fine_slope(features):.0f} times less power than coarse)"
+        )  # fmt: skip
+        if not force:
+            raise NoFabricError(
+                problem,
+                place=place,
+                remedy="take a sharp photo square to the cloth that shows 5 to 40 yarns each way, or use --force",
+            )
+        warnings = (_forced(problem),)
+        if not ranked:
+            return assumed_analysis(photo, warnings[0])
     best = ranked[0]
     blocks = cut(working, features, best)
     warp_f, weft_f = mean_frequency(best.warp), mean_frequency(best.weft)
@@ -85,26 +109,14 @@ def analyze_photo(linear: ArrayLike, place: str = "photo") -> PhotoAnalysis:
         weave_class=weave.classify(),
         weave_confidence=weave_sure if certain else 0.5 * weave_sure,
         lattice_confidence=confidence,
-        warnings=(),
+        warnings=warnings,
+        detail=(evidence.sharpness.coarse, evidence.sharpness.fine, evidence.slope) if evidence else None,
     )
     return _with_warnings(partial)
 
 
-def lattice_confidence(features: Features, ranked: list[Hypothesis]) -> float:
-    """How surely there is a woven lattice, [0, 1].
-
-    These must come together: the crossings make sense as a weave, both yarn frequencies hold over the whole photo,
-    each quarter of the photo shows the repeat of the others, and there are enough yarns to tell (four each way).
-    """
-    if not ranked:
-        return 0.0
-    best = ranked[0]
-    evidence = 1 / (1 + np.exp(-(best.fit.score - 8.0) / 3.0))
-    coherence = np.clip(np.sqrt(best.warp.coherence * best.weft.coherence) / 0.7, 0, 1)
-    agreement = np.clip((fold_agreement(features, best) - 0.70) / 0.12, 0, 1)
-    h, w = features.luma.shape
-    enough = np.clip((min(abs(best.warp.fx) * w, abs(best.weft.fy) * h) - 2) / 2, 0, 1)
-    return float(evidence * coherence * agreement * enough)
+def _forced(problem: str) -> str:
+    return f"Forced: {problem}."
 
 
 def count_confidence(ranked: list[Hypothesis], axis: int) -> float:
@@ -191,15 +203,7 @@ def _checked(linear: ArrayLike, place: str) -> Array:
         )
     if not np.isfinite(photo).all():
         raise UsdfabError("the photo holds values that are not finite", place=place)
-    photo = np.clip(photo, 0.0, 1.0)
-    light = photo.mean(2)
-    if float(np.quantile(light, 0.99) - np.quantile(light, 0.01)) < 1e-3:
-        raise UsdfabError(
-            "the photo has no contrast (all black, all white or one colour)",
-            place=place,
-            remedy="check exposure and focus",
-        )
-    return photo
+    return np.clip(photo, 0.0, 1.0)
 
 
 def _working_scale(shape: tuple[int, ...]) -> float:
@@ -240,4 +244,4 @@ def _with_warnings(a: PhotoAnalysis) -> PhotoAnalysis:
         out.append("The yarns are dark: gaps and shadows cannot be told apart, the widths are guesses.")
     if abs(a.skew) > np.radians(6):
         out.append(f"The two yarn systems are {np.degrees(abs(a.skew)):.0f} degrees off a right angle.")
-    return replace(a, warnings=tuple(out))
+    return replace(a, warnings=(*a.warnings, *out))

@@ -85,6 +85,9 @@ class PhotoAnalysis:
         That the photo shows a woven lattice at all, with these two spacings.
     warnings: tuple of str
         Plain sentences about what is uncertain.
+    detail: (float, float, float) or None
+        How little fine detail there is, in decades of power: ``coarse`` and ``fine`` of ``evidence.YarnSharpness``, and
+        ``evidence.fine_slope``.
     """
 
     shape: tuple[int, int]
@@ -100,6 +103,7 @@ class PhotoAnalysis:
     weave_confidence: float
     lattice_confidence: float
     warnings: tuple[str, ...]
+    detail: tuple[float, float, float] | None = None
 
     @property
     def warp_count(self) -> float:
