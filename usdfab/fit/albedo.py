@@ -31,6 +31,11 @@ MAX_ALBEDO = 0.995
 BRIGHT_ALBEDO = 0.95
 """Albedo of the brightest yarns of a photo that shows more light than the rig's standard exposure can explain."""
 
+DARK_ALBEDO = 0.06
+"""Albedo, in its darkest channel, of yarns more saturated than cloth can look under the rig's standard exposure."""
+
+LEAST_EXPOSURE = 0.1
+
 PATHS = 300_000
 """Paths in each render; a mean brightness is then good to about 2 %."""
 
@@ -78,11 +83,14 @@ def brightness_curves(
 
 
 def photo_exposure(shown: FabricParameters, curves: dict[System, BrightnessCurve]) -> float:
-    """How many times brighter than under the rig's standard light a photo is, 1 or more.
+    """How many times brighter than under the rig's standard light a photo is.
 
-    Light and albedo cannot be told apart in one photo. The rig's light is normalised so that a white diffuse surface
-    is 1, and cloth of white fibers is darker than that; a camera, however, exposes white cloth as white. So where the
-    photo's colours ask for more than fibers of albedo ``BRIGHT_ALBEDO`` give, the light was stronger.
+    Light and albedo cannot be told apart in one photo, but both ends are bounded. The rig's light is normalised so that
+    a white diffuse surface is 1, and cloth of white fibers is darker than that; a camera, however, exposes white cloth
+    as white. So where the photo's colours ask for more than fibers of albedo ``BRIGHT_ALBEDO`` give, the light was
+    stronger. And even black fibers reflect some light off their surface, which has no colour: where a channel is darker
+    than fibers of ``DARK_ALBEDO`` are, as in deep red cloth, the light was weaker. Between the two it is 1; of the two,
+    the first counts.
 
     Parameters
     ----------
@@ -91,12 +99,15 @@ def photo_exposure(shown: FabricParameters, curves: dict[System, BrightnessCurve
     curves:
         From ``brightness_curves`` of the same fabric.
     """
-    needed = 1.0
+    needed, allowed = LEAST_EXPOSURE, 1.0
     for system in SYSTEMS:
-        curve = curves[system]
-        possible = float(np.interp(BRIGHT_ALBEDO, curve.albedo, curve.brightness))
-        needed = max(needed, float(np.max(shown.system(system).colors())) / max(possible, 1e-6))
-    return needed
+        curve, colors = curves[system], np.asarray(shown.system(system).colors())
+        dark, bright = (
+            max(float(np.interp(c, curve.albedo, curve.brightness)), 1e-6) for c in (DARK_ALBEDO, BRIGHT_ALBEDO)
+        )
+        needed = max(needed, float(colors.max()) / bright)
+        allowed = min(allowed, float(colors.mean(axis=0).min()) / dark)
+    return max(needed, allowed)
 
 
 def visible_means(fabric: FabricParameters, paths: int = PATHS, seed: int = 0) -> dict[System, NDArray[np.float64]]:
@@ -170,8 +181,10 @@ def _read_backwards(
 
 
 def dimmed(fabric: FabricParameters, exposure: float) -> FabricParameters:
-    """``fabric`` with all its colours divided by an exposure of 1 or more."""
-    return with_colors(fabric, lambda _, c: (c[0] / exposure, c[1] / exposure, c[2] / exposure))
+    """``fabric`` with all its colours divided by an exposure; 1 at most."""
+    return with_colors(
+        fabric, lambda _, c: (min(c[0] / exposure, 1.0), min(c[1] / exposure, 1.0), min(c[2] / exposure, 1.0))
+    )
 
 
 def with_colors(fabric: FabricParameters, change: Callable[[System, Color], Color]) -> FabricParameters:
