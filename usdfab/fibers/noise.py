@@ -28,14 +28,15 @@ def perlin3(x: Any, y: Any, z: Any, seed: int) -> Any:
     seed:
         Chooses the lattice's gradients.
     """
-    from usdfab.fibers.noise_kernel import perlin_values  # noqa: PLC0415 - Numba takes a while to load
+    from usdfab.fibers.noise_kernel import perlin_values  # Numba takes a while to load
 
     coordinates = (x, y, z)
     places = [np.ascontiguousarray(_to_numpy(c), dtype=np.float64) for c in coordinates]
     count = places[0].size
     moving = any(is_torch_array(c) and c.requires_grad for c in coordinates)
     values, slopes = np.empty(count), np.empty((3, count if moving else 0))
-    perlin_values(*(p.ravel() for p in places), seed, _GRADIENTS, values, slopes)
+    px, py, pz = (p.ravel() for p in places)
+    perlin_values(px, py, pz, seed, _GRADIENTS, values, slopes)
     xp = array_namespace(x, y, z)
     noise = xp.asarray(values.reshape(places[0].shape), dtype=x.dtype)
     if moving:

@@ -7,17 +7,15 @@ import math
 import numpy as np
 from numba import njit
 
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-_A, _B = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+from usdfab.fibers.randomness import _GOLDEN, _mix
+
+_mix_one = njit(cache=True, inline="always")(_mix)
 
 
 @njit(cache=True, inline="always")
 def _further(state, key):
     """``randomness.hash_further`` of one integer."""
-    x = state + _GOLDEN + np.uint64(key)
-    x = (x ^ (x >> np.uint64(30))) * _A
-    x = (x ^ (x >> np.uint64(27))) * _B
-    return x ^ (x >> np.uint64(31))
+    return _mix_one(state + _GOLDEN + np.uint64(key))
 
 
 # No contraction to fused operations: a fabric's fibers are the same to the last bit on every machine.

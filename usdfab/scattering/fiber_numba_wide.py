@@ -232,19 +232,13 @@ def wide_slopes(m, lobes, low, high, cos_to, phi, weights, row):
     d_trt, trt_by_0, trt_by_1, trt_by_s, trt_by_scale = _mean_slopes(m, trt0, trt1)
     first, second, third, rest = lobes[0] * d_r, lobes[1] * d_tt, lobes[2] * d_trt, lobes[3] * _INV_TWO_PI
 
-    # Attenuations: sums over the colours of what each lobe's M D is multiplied by, and derivatives by F and the length.
+    # Attenuations of the three colours; sums of derivatives by F, the length of a crossing and the three inner M D.
     total = weights[0] + weights[1] + weights[2]
-    by_reflect, by_length = total * first, 0.0
-    by_second = by_third = by_rest = 0.0
-    value_0, by_reflect, by_length, by_second, by_third, by_rest = _inner_slopes(
-        m[0], weights[0], reflect, length, second, third, rest, by_reflect, by_length, by_second, by_third, by_rest, row, 0
-    )  # fmt: skip
-    value_1, by_reflect, by_length, by_second, by_third, by_rest = _inner_slopes(
-        m[1], weights[1], reflect, length, second, third, rest, by_reflect, by_length, by_second, by_third, by_rest, row, 1
-    )  # fmt: skip
-    value_2, by_reflect, by_length, by_second, by_third, by_rest = _inner_slopes(
-        m[2], weights[2], reflect, length, second, third, rest, by_reflect, by_length, by_second, by_third, by_rest, row, 2
-    )  # fmt: skip
+    sums = total * first, 0.0, 0.0, 0.0, 0.0
+    red, sums = _inner_slopes(m[0], weights[0], reflect, length, second, third, rest, sums, row, 0)
+    green, sums = _inner_slopes(m[1], weights[1], reflect, length, second, third, rest, sums, row, 1)
+    blue, sums = _inner_slopes(m[2], weights[2], reflect, length, second, third, rest, sums, row, 2)
+    by_reflect, by_length, by_second, by_third, by_rest = sums
     by_first = total * reflect
     by_lobes = by_first * d_r, by_second * d_tt, by_third * d_trt, by_rest * _INV_TWO_PI
     by_r, by_tt, by_trt = by_first * lobes[0], by_second * lobes[1], by_third * lobes[2]
@@ -284,27 +278,12 @@ def wide_slopes(m, lobes, low, high, cos_to, phi, weights, row):
     row[_ETA] += by_eta
     by_low, by_high = by_low + 0.5 * by_h, by_high + 0.5 * by_h
     base = first * reflect
-    return (base + value_0, base + value_1, base + value_2), by_lobes, (by_low, by_high, by_cos_to, by_0 + by_1)
+    return (base + red, base + green, base + blue), by_lobes, (by_low, by_high, by_cos_to, by_0 + by_1)
 
 
 @njit(**_OPTIONS)
-def _inner_slopes(
-    sigma,
-    weight,
-    reflect,
-    length,
-    second,
-    third,
-    rest,
-    by_reflect,
-    by_length,
-    by_second,
-    by_third,
-    by_rest,
-    row,
-    channel,
-):
-    """``_inner`` and, added to what is given, derivatives by F, the length and the three M D."""
+def _inner_slopes(sigma, weight, reflect, length, second, third, rest, sums, row, channel):
+    """``_inner``, and ``sums`` with this colour's derivatives by F, the length and the three M D added."""
     transmit = _exp(-sigma * length)
     inside = reflect * transmit
     outer = (1.0 - reflect) * (1.0 - reflect) * transmit
@@ -315,11 +294,10 @@ def _inner_slopes(
     by_transmit = by_outer * (1.0 - reflect) * (1.0 - reflect) + by_inside * reflect
     row[channel] -= by_transmit * transmit * length
     weighted = weight * outer
-    return (
-        outer * bracket,
-        by_reflect + by_inside * transmit - 2.0 * by_outer * (1.0 - reflect) * transmit,
-        by_length - by_transmit * transmit * sigma,
-        by_second + weighted,
-        by_third + weighted * inside,
-        by_rest + weighted * inside * inside * over,
+    return outer * bracket, (
+        sums[0] + by_inside * transmit - 2.0 * by_outer * (1.0 - reflect) * transmit,
+        sums[1] - by_transmit * transmit * sigma,
+        sums[2] + weighted,
+        sums[3] + weighted * inside,
+        sums[4] + weighted * inside * inside * over,
     )

@@ -227,7 +227,9 @@ class Reference:
                     ]
                     shines = blended(shines, parts)
                 lit = shines[rows, 0]
-            to_lamp = torch.from_numpy((lamp - self.starts(hit)) / self.scale) - distance[:, None] * self.directions[rows]
+            to_lamp = (
+                torch.from_numpy((lamp - self.starts(hit)) / self.scale) - distance[:, None] * self.directions[rows]
+            )
             light = self._shaded(look_, segment, tangent, h, self.directions[rows], spread, to_lamp)
             intensity = torch.from_numpy(view.intensity[k] / self.scale**2)
             flat = flat.index_add(0, rows, light * lit[:, None] * intensity)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from usdfab.fit.raster.curves import as_numpy
-from usdfab.fit.raster.segments import _INLINE
+from usdfab.fit.raster.segments import INLINE
 from usdfab.tracer.intrinsics import KERNEL
 
 Ints = NDArray[np.int64]
@@ -60,14 +60,14 @@ def _pairs_along_rows(number: Ints, aside: Ints) -> Pairs:
     return Pairs(*(a.ravel() for a in (number[:, :-1], number[:, 1:], aside[:, :-1], before[:, :-1], after[:, 1:])))
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def crossing(at_p, at_q):
     """t in [0, 1] where a jump function that runs straight from ``at_p`` to ``at_q`` passes zero."""
     difference = at_q - at_p
     return min(max(-at_p / (difference if abs(difference) > 1e-9 else 1e-9), 0.0), 1.0)
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def crossing_slopes(at_p, at_q):
     """Derivatives of ``crossing`` by its arguments."""
     difference = at_q - at_p

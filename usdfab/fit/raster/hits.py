@@ -12,10 +12,10 @@ from torch import Tensor
 
 from usdfab.fit.raster.curves import Polylines, as_numpy
 from usdfab.fit.raster.segments import (
-    _EPSILON,
-    _INLINE,
     BLOCK,
+    EPSILON,
     FOLLOWING,
+    INLINE,
     SYSTEM,
     Floats,
     Geometry,
@@ -64,7 +64,8 @@ class _Meet(torch.autograd.Function):
     def backward(
         ctx: Any, by_distance: Tensor, by_tangent: Tensor, by_h: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, None, None]:
-        arguments = _arguments(*ctx.saved_tensors, ctx.geometry, ctx.seen)
+        points_, tangents_, radius_ = ctx.saved_tensors
+        arguments = _arguments(points_, tangents_, radius_, ctx.geometry, ctx.seen)
         points, tangents, radius = (np.zeros(tuple(t.shape)) for t in ctx.saved_tensors)
         given = (np.ascontiguousarray(as_numpy(g)) for g in (by_distance, by_tangent, by_h))
         _meet_slopes(*arguments, *given, points, tangents, radius)
@@ -90,7 +91,7 @@ def in_units(geometry: Geometry, points: Tensor, radius: Tensor) -> tuple[Floats
     return as_numpy(points) / geometry.scale, as_numpy(radius) / geometry.scale
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def meeting(ends, tangents, radius, dx, dy, dz):
     """Where a ray from the origin enters a segment: (distance, tangent (3), h).
 
@@ -101,43 +102,43 @@ def meeting(ends, tangents, radius, dx, dy, dz):
     """
     h, middle, half = pass_by(ends, radius, dx, dy, dz)
     h = min(max(h, -1.0), 1.0)
-    t = middle - half * math.sqrt(max(1.0 - h * h, 0.0) + _EPSILON)
+    t = middle - half * math.sqrt(max(1.0 - h * h, 0.0) + EPSILON)
     tx, ty, tz, nx, ny, nz, _, _ = _smooth(ends, tangents, t, dx, dy, dz)
     ax, ay, az = dy * tz - dz * ty, dz * tx - dx * tz, dx * ty - dy * tx
-    scale = math.sqrt((ax * ax + ay * ay + az * az) * (nx * nx + ny * ny + nz * nz) + _EPSILON)
+    scale = math.sqrt((ax * ax + ay * ay + az * az) * (nx * nx + ny * ny + nz * nz) + EPSILON)
     return t, tx, ty, tz, min(max(-(nx * ax + ny * ay + nz * az) / scale, -1.0), 1.0)
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _smooth(ends, tangents, t, dx, dy, dz):
     """At distance t: unit tangent (3), from the axis to there across the tangent (3), place along the segment, and the
     tangent's length before it was made one."""
     sx, sy, sz, ex, ey, ez = ends
     cx, cy, cz = ex - sx, ey - sy, ez - sz
     qx, qy, qz = t * dx - sx, t * dy - sy, t * dz - sz
-    u = (qx * cx + qy * cy + qz * cz) / (cx * cx + cy * cy + cz * cz + _EPSILON)
+    u = (qx * cx + qy * cy + qz * cz) / (cx * cx + cy * cy + cz * cz + EPSILON)
     u = min(max(u, 0.0), 1.0)
     tx = (1.0 - u) * tangents[0] + u * tangents[3]
     ty = (1.0 - u) * tangents[1] + u * tangents[4]
     tz = (1.0 - u) * tangents[2] + u * tangents[5]
-    norm = math.sqrt(tx * tx + ty * ty + tz * tz + _EPSILON)
+    norm = math.sqrt(tx * tx + ty * ty + tz * tz + EPSILON)
     tx, ty, tz = tx / norm, ty / norm, tz / norm
     nx, ny, nz = qx - u * cx, qy - u * cy, qz - u * cz
     along = nx * tx + ny * ty + nz * tz
     return tx, ty, tz, nx - along * tx, ny - along * ty, nz - along * tz, u, norm
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def meeting_slopes(ends, tangents, radius, dx, dy, dz, by_t, by_tx, by_ty, by_tz, by_h):
     """Derivatives of a loss by ends (6), tangents (6) and radius, from those by what ``meeting`` returns: 13 floats."""
     passing, middle, half = pass_by(ends, radius, dx, dy, dz)
     h = min(max(passing, -1.0), 1.0)
-    root = math.sqrt(max(1.0 - h * h, 0.0) + _EPSILON)
+    root = math.sqrt(max(1.0 - h * h, 0.0) + EPSILON)
     t = middle - half * root
     tx, ty, tz, nx, ny, nz, u, norm = _smooth(ends, tangents, t, dx, dy, dz)
     ax, ay, az = dy * tz - dz * ty, dz * tx - dx * tz, dx * ty - dy * tx
     a2, n2 = ax * ax + ay * ay + az * az, nx * nx + ny * ny + nz * nz
-    scale = math.sqrt(a2 * n2 + _EPSILON)
+    scale = math.sqrt(a2 * n2 + EPSILON)
     offset = -(nx * ax + ny * ay + nz * az) / scale
 
     # offset = -(n . a) / scale, scale^2 = a^2 n^2 + epsilon; a = d x t
@@ -166,7 +167,7 @@ def meeting_slopes(ends, tangents, radius, dx, dy, dz, by_t, by_tx, by_ty, by_tz
     by_cx, by_cy, by_cz = -u * gx, -u * gy, -u * gz
 
     # u = q . c / c^2, held in [0, 1]
-    c2 = cx * cx + cy * cy + cz * cz + _EPSILON
+    c2 = cx * cx + cy * cy + cz * cz + EPSILON
     if 0.0 < u < 1.0:
         k = by_u / c2
         gx, gy, gz = gx + k * cx, gy + k * cy, gz + k * cz
@@ -184,7 +185,7 @@ def meeting_slopes(ends, tangents, radius, dx, dy, dz, by_t, by_tx, by_ty, by_tz
     )  # fmt: skip
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _tangents_of(tangents, topology, segment):
     n = topology[segment, FOLLOWING]
     return (

@@ -20,8 +20,8 @@ from usdfab.fit.raster.curves import Polylines, as_numpy
 from usdfab.fit.raster.edges import Jumps, Pairs, crossing, crossing_slopes
 from usdfab.fit.raster.hits import in_units
 from usdfab.fit.raster.segments import (
-    _INLINE,
     BLOCK,
+    INLINE,
     SYSTEM,
     Geometry,
     add_to_ends,
@@ -115,7 +115,7 @@ class _Crossing(torch.autograd.Function):
         return torch.from_numpy(by_points), torch.from_numpy(by_radius), None, None, None, None
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _profile(points, radius, topology, size, start, direction, segment, i, j, at):
     """h of a fiber from the ray of pixel ``at``, the depth of its axis, its radius along the ray; and the segment.
 
@@ -129,13 +129,13 @@ def _profile(points, radius, topology, size, start, direction, segment, i, j, at
     return h, -dz * middle, -dz * half, segment, i, j
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _depth(h, axis, unit):
     """Of a fiber's surface; beyond its sides, of the sides."""
     return axis - unit * math.sqrt(max(1.0 - h * h, _LEAST_ROOT))
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _showing(h, axis, unit, behind):
     """The jump function of a fiber before a surface at depth ``behind``."""
     sunk = max((axis - behind) / unit, 0.0)
@@ -203,7 +203,7 @@ def _cross(
         for m in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
             one, other = (p[m], q[m]) if kinds[m] == P_ENDS else (q[m], p[m])
             a, i, j = np.int64(segment[one]), np.int64(copy[one, 0]), np.int64(copy[one, 1])
-            b, k, l = np.int64(segment[other]), np.int64(copy[other, 0]), np.int64(copy[other, 1])
+            b, k, n = np.int64(segment[other]), np.int64(copy[other, 0]), np.int64(copy[other, 1])
             first = second = 0.0
             for side in range(2):
                 at = p[m] if side == 0 else q[m]
@@ -213,7 +213,7 @@ def _cross(
                 beside[2 + side, m] = NOTHING
                 if b >= 0:
                     ho, axis_o, unit_o, s, x, y = _profile(
-                        points, radius, topology, size, start, direction, b, k, l, at
+                        points, radius, topology, size, start, direction, b, k, n, at
                     )  # fmt: skip
                     beside[2 + side, m], copies[2 + side, m, 0], copies[2 + side, m, 1] = s, x, y
                     behind = _depth(ho, axis_o, unit_o)
@@ -254,7 +254,7 @@ def _cross_slopes(
             )  # fmt: skip
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _settled_profile(points, radius, topology, size, start, direction, beside, copies, m, which, at):
     s = beside[which, m]
     ends = ends_of(
@@ -266,7 +266,7 @@ def _settled_profile(points, radius, topology, size, start, direction, beside, c
     return h, down * middle, down * half, ends, thick
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _showing_beside(points, radius, topology, size, start, direction, beside, copies, m, side, at):
     """The jump function at pixel ``at``, which is p (side 0) or q (1)."""
     h, axis, unit, _, _ = _settled_profile(

@@ -28,8 +28,10 @@ STEPS = 2
 BLOCK = 1024
 """Rays or pairs of pixels that a thread takes at a time."""
 
-_EPSILON = 1e-12
-_INLINE: dict[str, Any] = {**KERNEL, "forceinline": True}
+EPSILON = 1e-12
+"""Added under roots, which have no slope at 0."""
+INLINE: dict[str, Any] = {**KERNEL, "forceinline": True}
+"""Options of functions that kernels call for each ray: their tuples stay in registers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +73,7 @@ def geometry_of(model: CurveModel, start: Floats, direction: Floats, scale: floa
     )
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def ends_of(points, topology, size, segment, i, j, ox, oy, oz):
     """Both ends of a segment in copy (i, j) of the patch, relative to a place: 6 floats."""
     n = topology[segment, FOLLOWING]
@@ -83,7 +85,7 @@ def ends_of(points, topology, size, segment, i, j, ox, oy, oz):
     )  # fmt: skip
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def cylinder(ends, radius, dx, dy, dz):
     """How a ray from the origin passes the infinite cylinder about a segment.
 
@@ -100,7 +102,7 @@ def cylinder(ends, radius, dx, dy, dz):
     """
     sx, sy, sz, ex, ey, ez = ends
     ax, ay, az = ex - sx, ey - sy, ez - sz
-    length = math.sqrt(ax * ax + ay * ay + az * az + _EPSILON)
+    length = math.sqrt(ax * ax + ay * ay + az * az + EPSILON)
     ax, ay, az = ax / length, ay / length, az / length
     b = dx * ax + dy * ay + dz * az
     sin2 = max(1.0 - b * b, 1e-6)
@@ -109,11 +111,11 @@ def cylinder(ends, radius, dx, dy, dz):
     middle = (sx * dx + sy * dy + sz * dz - b * along_axis) / sin2
     half = radius / sin
     h = (sx * (dy * az - dz * ay) + sy * (dz * ax - dx * az) + sz * (dx * ay - dy * ax)) / (sin * radius)
-    entry = middle - half * math.sqrt(max(1.0 - h * h, 0.0) + _EPSILON)
+    entry = middle - half * math.sqrt(max(1.0 - h * h, 0.0) + EPSILON)
     return h, middle, half, (b * entry - along_axis) / length
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def pass_by(ends, radius, dx, dy, dz):
     """How a ray from the origin passes a segment.
 
@@ -132,11 +134,11 @@ def pass_by(ends, radius, dx, dy, dz):
     cx, cy, cz = (ends[3], ends[4], ends[5]) if along > 1.0 else (ends[0], ends[1], ends[2])
     nearest = cx * dx + cy * dy + cz * dz
     x, y, z = cx - nearest * dx, cy - nearest * dy, cz - nearest * dz
-    distance = math.sqrt(x * x + y * y + z * z + _EPSILON) / radius
+    distance = math.sqrt(x * x + y * y + z * z + EPSILON) / radius
     return (-distance if h < 0.0 else distance), nearest, radius
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def pass_by_slopes(ends, radius, dx, dy, dz, by_h, by_middle, by_half):
     """Derivatives of a loss by the arguments of ``pass_by``, from those by its results.
 
@@ -150,7 +152,7 @@ def pass_by_slopes(ends, radius, dx, dy, dz, by_h, by_middle, by_half):
         cx, cy, cz = (ex, ey, ez) if along > 1.0 else (sx, sy, sz)
         nearest = cx * dx + cy * dy + cz * dz
         x, y, z = cx - nearest * dx, cy - nearest * dy, cz - nearest * dz
-        away = math.sqrt(x * x + y * y + z * z + _EPSILON)
+        away = math.sqrt(x * x + y * y + z * z + EPSILON)
         g = (-by_h if h < 0.0 else by_h) / (radius * away)
         x, y, z = g * x, g * y, g * z
         back = x * dx + y * dy + z * dz
@@ -162,7 +164,7 @@ def pass_by_slopes(ends, radius, dx, dy, dz, by_h, by_middle, by_half):
             return 0.0, 0.0, 0.0, gx, gy, gz, by_radius, by_d[0], by_d[1], by_d[2]
         return gx, gy, gz, 0.0, 0.0, 0.0, by_radius, by_d[0], by_d[1], by_d[2]
     ax, ay, az = ex - sx, ey - sy, ez - sz
-    length = math.sqrt(ax * ax + ay * ay + az * az + _EPSILON)
+    length = math.sqrt(ax * ax + ay * ay + az * az + EPSILON)
     ax, ay, az = ax / length, ay / length, az / length
     b = dx * ax + dy * ay + dz * az
     sin2 = max(1.0 - b * b, 1e-6)
@@ -190,7 +192,7 @@ def pass_by_slopes(ends, radius, dx, dy, dz, by_h, by_middle, by_half):
     return gx - cx, gy - cy, gz - cz, cx, cy, cz, by_radius, by_dx, by_dy, by_dz
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def settled(points, radius, topology, size, segment, i, j, ox, oy, oz, dx, dy, dz):
     """The segment of a fiber that lies nearest to a ray: (segment, i, j).
 
@@ -212,7 +214,7 @@ def settled(points, radius, topology, size, segment, i, j, ox, oy, oz, dx, dy, d
     return segment, i, j
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def same_fiber(topology, segment, copy, p, q):
     """Whether pixels p and q show the same piece of fiber, or two that continue each other; or both nothing."""
     a, b = segment[p], segment[q]

@@ -7,12 +7,11 @@ attenuation and normal count as constant and D is averaged (``usdfab.scattering.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit, prange
 
-from usdfab.fit.raster.segments import BLOCK, SYSTEM
+from usdfab.fit.raster.segments import BLOCK, INLINE, SYSTEM
 from usdfab.scattering.fiber_numba_wide import WIDE_SIZE, wide_lobes, wide_lobes_slopes, wide_slopes, wide_value
 from usdfab.tracer.intrinsics import KERNEL, borrow
 
@@ -30,10 +29,9 @@ _EDGE = 1.0 - 1e-6
 
 _TINY = 1e-12
 _LEAST = 1e-8
-_INLINE: dict[str, Any] = {**KERNEL, "forceinline": True}
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _frame(distance, tx, ty, tz, dx, dy, dz, ox, oy, oz):
     """At a hit under a lamp at (ox, oy, oz) from the start of the ray: the lamp's direction (3) and squared distance;
     f and e of the normal plane (6) and the length of d x t; sines of both inclinations, the lamp's part along e and f.
@@ -52,7 +50,7 @@ def _frame(distance, tx, ty, tz, dx, dy, dz, ox, oy, oz):
     return (x, y, z, squared), (fx, fy, fz, ex, ey, ez, norm), sin_to, sin_ti, along_e, along_f
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _angles(sin_to, along_e, along_f):
     """(cos_to, cos_ti, phi)."""
     cos_to = math.sqrt(max(1.0 - sin_to * sin_to, _LEAST))
@@ -62,19 +60,34 @@ def _angles(sin_to, along_e, along_f):
     return cos_to, cos_ti, phi
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _range(h, spread):
     """(gamma from, gamma to, number of pieces)."""
     low = math.asin(min(max(h - 0.5 * spread, -_EDGE), _EDGE))
     high = math.asin(min(max(h + 0.5 * spread, -_EDGE), _EDGE))
-    return low, high, max(int(math.ceil((high - low) / PIECE)), 1)
+    return low, high, max(math.ceil((high - low) / PIECE), 1)
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _diffuse(h, along_e, along_f, up):
     """The diffuse term over k_d."""
     fiber = math.sqrt(1.0 - h * h) * along_e - h * along_f
     return (DIFFUSE_WEIGHT * max(fiber, 0.0) + (1.0 - DIFFUSE_WEIGHT) * max(up, 0.0)) / math.pi
+
+
+# Loops, since Numba takes seconds to compile what adds whole arrays.
+@njit(**INLINE)
+def _copy_row(table, row, target):
+    for c in range(len(target)):
+        target[c] = table[row, c]
+
+
+@njit(**INLINE)
+def _move(sums, totals, block, row):
+    """Add sums to one row's of a block, and begin again."""
+    for c in range(len(sums)):
+        totals[block, row, c] += sums[c]
+        sums[c] = 0.0
 
 
 @njit(**KERNEL, parallel=True)
@@ -95,7 +108,9 @@ def shade(
                 continue
             row = color[s]
             if row != before:
-                m[:], turn[:], before = rows[row], turns[row], row
+                _copy_row(rows, row, m)
+                _copy_row(turns, row, turn)
+                before = row
             low, high, pieces = _range(h_[k], spread[topology[s, SYSTEM]])
             for lamp in range(len(lamps)):
                 if lit[k, lamp] <= 0.0:
@@ -153,9 +168,10 @@ def shade_slopes(
             row = color[s]
             if row != before:
                 if before >= 0:
-                    material_sums[block, before] += sums
-                    sums[:] = 0.0
-                m[:], turn[:], before = rows[row], turns[row], row
+                    _move(sums, material_sums, block, before)
+                _copy_row(rows, row, m)
+                _copy_row(turns, row, turn)
+                before = row
             system = topology[s, SYSTEM]
             for lamp in range(len(lamps)):
                 if lit[k, lamp] <= 0.0:
@@ -175,18 +191,21 @@ def shade_slopes(
                 by_lit[k, lamp] = found[5]
                 spread_sums[block, system] += found[6]
         if before >= 0:
-            material_sums[block, before] += sums
+            _move(sums, material_sums, block, before)
     for block in range(blocks):
-        by_spread += spread_sums[block]
-        by_material += material_sums[block]
+        for system in range(2):
+            by_spread[system] += spread_sums[block, system]
+        for row in range(len(material)):
+            for c in range(MATERIAL):
+                by_material[row, c] += material_sums[block, row, c]
 
 
 @njit(**KERNEL)
 def _pixel_slopes(
     m, turn, single, diffuse, sums, distance, tx, ty, tz, h, spread, dx, dy, dz, ox, oy, oz, lit, by_r, by_g, by_b
 ):  # fmt: skip
-    """Derivatives of a loss by (distance, tangent (3), h, lit, spread), from those by the light of one lamp of intensity
-    1; those by the material are added to ``sums``."""
+    """Derivatives of a loss by (distance, tangent (3), h, lit, spread), from those by the light of a lamp of 1 W/sr;
+    those by the material are added to ``sums``."""
     to_lamp, plane, sin_to, sin_ti, along_e, along_f = _frame(distance, tx, ty, tz, dx, dy, dz, ox, oy, oz)
     x, y, z, squared = to_lamp
     cos_to, cos_ti, phi = _angles(sin_to, along_e, along_f)

@@ -15,8 +15,8 @@ from usdfab.fit.raster.curves import Polylines, as_numpy
 from usdfab.fit.raster.edges import Jumps, Pairs, crossing, crossing_slopes
 from usdfab.fit.raster.hits import in_units
 from usdfab.fit.raster.segments import (
-    _INLINE,
     BLOCK,
+    INLINE,
     SYSTEM,
     Floats,
     Geometry,
@@ -108,7 +108,7 @@ class _Crossing(torch.autograd.Function):
         )  # fmt: skip
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _ray(start, direction, distance, lamp, at):
     """From what pixel ``at`` sees to the lamp: (place (3), unit vector (3), length)."""
     t = distance[at]
@@ -120,7 +120,7 @@ def _ray(start, direction, distance, lamp, at):
     return ox, oy, oz, x / length, y / length, z / length, length
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _cast(points, radius, topology, size, start, direction, distance, lamp, segment, i, j, at):
     """h of the fiber that casts the shadow, along the ray of pixel ``at``; and its segment there."""
     ox, oy, oz, x, y, z, _ = _ray(start, direction, distance, lamp, at)
@@ -233,7 +233,7 @@ def _cross_slopes(
             by_distance[q[base + row]] += distance_slopes[1, row]
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _offset(points, radius, topology, size, start, direction, distance, lamp, beside, copies, m, side, at):
     """h of the caster's settled segment, and what it was made of: (h, ends, radius, unit vector (3), length)."""
     ox, oy, oz, x, y, z, length = _ray(start, direction, distance, lamp, at)
