@@ -1,5 +1,6 @@
 """The kernels of the rasterizer against the same picture in plain torch with gradients by autograd."""
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -57,11 +58,15 @@ def test_jumps_are_classified_as_in_torch(name):
         assert (kinds != expected).sum() <= 1e-3 * (expected != 0).sum()
 
 
-def test_gradients_are_the_same_bits_every_time():
+def test_gradients_are_the_same_bits_with_any_number_of_threads():
     found = []
-    for _ in range(2):
-        renderer = coarse_renderer(16)
-        shapes, look, named = leaves(renderer)
-        renderer.image(shapes, look).square().sum().backward()
-        found.append([v.grad.numpy().copy() for v in named.values() if v.grad is not None])
+    try:
+        for threads in (1, numba.config.NUMBA_NUM_THREADS):
+            numba.set_num_threads(threads)
+            renderer = coarse_renderer(24)
+            shapes, look, named = leaves(renderer)
+            renderer.image(shapes, look).square().sum().backward()
+            found.append([v.grad.numpy().copy() for v in named.values() if v.grad is not None])
+    finally:
+        numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     assert all(np.array_equal(a, b) for a, b in zip(*found, strict=True))
