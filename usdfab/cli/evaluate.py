@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from usdfab.cli.options import Json, Seed, print_json, progress_bar
+from usdfab.cli.options import Json, OptionalOutput, Overwrite, Seed, print_json, progress_bar, say
 from usdfab.errors import UsdfabError
 
 
 def run(
-    what: Literal["photos", "losses", "raster", "path"],
+    what: Literal["photos", "losses", "raster", "ablation", "path"],
     folder: Path | None = None,
     /,
     *,
@@ -21,6 +21,8 @@ def run(
     quality: Literal["draft", "standard", "paper"] = "draft",
     ablation: bool = False,
     fibers: int | None = None,
+    output: OptionalOutput = None,
+    overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Judge usdfab's estimates on labelled photos or random fabrics, or the losses of the fit, and print a table.
@@ -30,6 +32,7 @@ def run(
         usdfab evaluate photos FOLDER
         usdfab evaluate losses FOLDER
         usdfab evaluate raster --count 1 --fibers 40
+        usdfab evaluate ablation --fibers 40 -o ablation
         usdfab evaluate path --count 3 --seed 1
 
     Parameters
@@ -37,7 +40,8 @@ def run(
     what:
         photos: the analysis stage on real cloth. losses: which texture statistics tell fabrics apart (needs the fit
         extra). raster, path: how well that stage recovers random fabrics of each weave from 20 % off (slow: a
-        fit for each; needs the fit extra).
+        fit for each; needs the fit extra). ablation: what the raster stage finds without parts of its shading, its
+        losses and its prior, as in figures 15, 17 and 18 of Li et al. 2024 (ten fits; needs the fit extra).
     folder:
         Of photos and losses: holds the photos. For photos also SOURCES.csv with the columns file, weave and notes
         ("about N yarns across horizontally and M vertically"); for losses two or more PNG files.
@@ -46,21 +50,27 @@ def run(
     fast:
         Of losses: compute as the fit does, in bfloat16 where the processor has it.
     count:
-        Of raster: fabrics of each of the four weaves; of path: how many fabrics, plain, twill and satin in turn.
+        Of raster and ablation: fabrics of each weave; of path: how many fabrics, plain, twill and satin in turn.
     quality:
-        Of raster and path: resolution, samples and iterations, as of ``usdfab fit``.
+        Of raster, ablation and path: resolution, samples and iterations, as of ``usdfab fit``.
     ablation:
         Of raster: each fabric also without parts of the shading and of the losses (six fits for each).
     fibers:
-        Of raster: fibers in a yarn, instead of about 200, to save time.
+        Of raster and ablation: fibers in a yarn, instead of about 200, to save time.
+    output:
+        Of ablation: a folder for its pictures (the target, then each way, side by side) and ablation.json.
     """
-    if what in ("raster", "path"):
+    if output is not None and what != "ablation":
+        raise UsdfabError(f"evaluate {what} writes no files", place="--output", remedy="leave it out")
+    if what in ("raster", "ablation", "path"):
         if folder is not None:
             raise UsdfabError(
                 f"evaluate {what} makes its own fabrics", place=str(folder), remedy="leave the folder out"
             )
         if what == "raster":
             _raster(count, seed, quality, ablation, fibers, json)
+        elif what == "ablation":
+            _ablation(count, seed, quality, fibers, output, overwrite, json)
         else:
             _path(count, seed, quality, json)
         return
@@ -107,6 +117,28 @@ def _raster(count: int, seed: int, quality: str, ablation: bool, fibers: int | N
         print_json({"recoveries": [asdict(r) for r in results]})
     else:
         print(format_recoveries(results))
+
+
+def _ablation(
+    count: int, seed: int, quality: str, fibers: int | None, output: Path | None, overwrite: bool, json: bool
+) -> None:
+    from usdfab.fit.extra import require_fit_extra
+
+    require_fit_extra("evaluate ablation")
+    from usdfab.fit.raster_ablation import evaluate_ablation, format_ablation, planned_files, write_ablation
+    from usdfab.fit.raster_stage import checked_quality
+
+    settings = checked_quality(quality)
+    paths = planned_files(output, count, overwrite=overwrite) if output else {}
+    with progress_bar("Ablation") as update:
+        results = evaluate_ablation(count, seed, settings, fibers=fibers, progress=update)
+    if paths:
+        write_ablation(results, paths, overwrite=overwrite)
+        say(f"wrote {output}")
+    if json:
+        print_json({"results": [r.summary() for r in results]})
+    else:
+        print(format_ablation(results))
 
 
 def _losses(folder: Path, features: str, fast: bool, json: bool) -> None:

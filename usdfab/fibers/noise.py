@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from array_api_compat import array_namespace, is_torch_array
 
-from usdfab.fibers.randomness import hash_further, hash_integers
-
 # The twelve directions from the centre of a cube to its edges (Perlin 2002), four of them repeated to make sixteen.
 _GRADIENTS = np.array(
     [
@@ -19,38 +17,35 @@ _GRADIENTS = np.array(
 )  # fmt: skip
 
 
-def _to_numpy(array: Any) -> np.ndarray:
-    return array.detach().cpu().numpy() if is_torch_array(array) else np.asarray(array)
-
-
 def perlin3(x: Any, y: Any, z: Any, seed: int) -> Any:
     """Three-dimensional Perlin noise in about [-1, 1].
 
     Parameters
     ----------
     x, y, z:
-        Coordinates, arrays of one shape; the lattice has unit spacing.
+        Coordinates, arrays of NumPy or torch of one shape; the lattice has unit spacing. With torch the noise has
+        gradients of the first order.
     seed:
         Chooses the lattice's gradients.
     """
-    xp = array_namespace(x, y, z)
+    from usdfab.fibers.noise_kernel import perlin_values  # Numba takes a while to load
+
     coordinates = (x, y, z)
-    floors = [np.floor(_to_numpy(c)) for c in coordinates]
-    fractions = [c - xp.asarray(f, dtype=c.dtype) for c, f in zip(coordinates, floors, strict=True)]
-    fades = [t * t * t * (t * (t * 6.0 - 15.0) + 10.0) for t in fractions]
-    # Lattice points of the cell's corners, hashed axis by axis.
-    states = [hash_integers(seed)]
-    for f in floors:
-        states = [hash_further(state, f + bit) for bit in range(2) for state in states]
-    total: Any = 0.0
-    for corner in range(8):
-        bits = [(corner >> k) & 1 for k in range(3)]
-        gradient = _GRADIENTS[(states[corner] >> np.uint64(60)).astype(np.int64)]
-        dot: Any = 0.0
-        weight: Any = 1.0
-        for k in range(3):
-            g = xp.asarray(np.ascontiguousarray(gradient[..., k]), dtype=x.dtype)
-            dot = dot + g * (fractions[k] - bits[k])
-            weight = weight * (fades[k] if bits[k] else 1.0 - fades[k])
-        total = total + weight * dot
-    return total
+    places = [np.ascontiguousarray(_to_numpy(c), dtype=np.float64) for c in coordinates]
+    count = places[0].size
+    moving = any(is_torch_array(c) and c.requires_grad for c in coordinates)
+    values, slopes = np.empty(count), np.empty((3, count if moving else 0))
+    px, py, pz = (p.ravel() for p in places)
+    perlin_values(px, py, pz, seed, _GRADIENTS, values, slopes)
+    xp = array_namespace(x, y, z)
+    noise = xp.asarray(values.reshape(places[0].shape), dtype=x.dtype)
+    if moving:
+        for c, slope in zip(coordinates, slopes, strict=True):
+            if c.requires_grad:
+                # Zero, with the noise's gradient.
+                noise = noise + xp.asarray(slope.reshape(places[0].shape), dtype=x.dtype) * (c - c.detach())
+    return noise
+
+
+def _to_numpy(array: Any) -> np.ndarray:
+    return array.detach().cpu().numpy() if is_torch_array(array) else np.asarray(array)

@@ -12,15 +12,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import SYSTEMS, FabricParameters
 from usdfab.fabric.optics import ROUGHNESSES
 from usdfab.fabric.parameters import PARAMETER_BY_NAME
 from usdfab.fabric.sampling import sample_fabric
+from usdfab.fit.features import FeatureNet
 from usdfab.fit.path_stage import start_from_joint
 from usdfab.fit.raster.unconstrained import soft_range
-from usdfab.fit.raster_stage import StageSettings, refine_by_raster, render_size
+from usdfab.fit.raster_stage import StageResult, StageSettings, refine_by_raster, render_size
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import swatch_scene
 
@@ -88,6 +90,8 @@ class Recovery:
 
 
 Progress = Callable[[int, int, str], None]
+Watch = Callable[[Recovery, NDArray, StageResult], None]
+"""Called with each fit's recovery, its target (H, W, 3) and its result."""
 
 
 def evaluate_raster(
@@ -99,6 +103,8 @@ def evaluate_raster(
     ablations: Sequence[str] = ("full",),
     fibers: int | None = None,
     progress: Progress | None = None,
+    watch: Watch | None = None,
+    net: FeatureNet | None = None,
 ) -> list[Recovery]:
     """Fit ``count`` fabrics of each weave in every way of ``ablations``.
 
@@ -132,7 +138,7 @@ def evaluate_raster(
                 if progress:
                     progress(base + k, steps, f"{label}: {loss:.3f}")
 
-            found = refine_by_raster(start, target, chosen, progress=say)
+            found = refine_by_raster(start, target, chosen, net=net, progress=say)
             done += settings.iterations
             if found.interrupted:
                 return results
@@ -151,6 +157,8 @@ def evaluate_raster(
                     time.perf_counter() - begun,
                 )
             )
+            if watch:
+                watch(results[-1], target, found)
     return results
 
 

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
+from raster_reference import Segments
+from raster_rows import crossing, meet, pass_by
 from raster_scenes import coarse_fabric
 
 from usdfab.errors import UsdfabError
 from usdfab.fibers import generate_patch
 from usdfab.fit.raster.curves import CurveModel
-from usdfab.fit.raster.edges import Jumps, blended, crossing, pixel_pairs
-from usdfab.fit.raster.hits import Segments, meet, pass_by
+from usdfab.fit.raster.edges import Jumps, blended, pixel_pairs
 from usdfab.fit.raster.view import view_of
 from usdfab.fit.raster.visibility import NOTHING, index_patch, look
 from usdfab.usd.rig import Rig, swatch_scene

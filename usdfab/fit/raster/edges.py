@@ -14,11 +14,17 @@ the shadow's caster, seen from the lamp, at the rim of a shadow.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
+
+from usdfab.fit.raster.curves import as_numpy
+from usdfab.fit.raster.segments import INLINE
+from usdfab.tracer.intrinsics import KERNEL
 
 Ints = NDArray[np.int64]
 
@@ -54,11 +60,21 @@ def _pairs_along_rows(number: Ints, aside: Ints) -> Pairs:
     return Pairs(*(a.ravel() for a in (number[:, :-1], number[:, 1:], aside[:, :-1], before[:, :-1], after[:, 1:])))
 
 
-def crossing(at_p: Tensor, at_q: Tensor) -> Tensor:
+@njit(**INLINE)
+def crossing(at_p, at_q):
     """t in [0, 1] where a jump function that runs straight from ``at_p`` to ``at_q`` passes zero."""
     difference = at_q - at_p
-    safe = torch.where(difference.abs() > 1e-9, difference, torch.full_like(difference, 1e-9))
-    return (-at_p / safe).clamp(0.0, 1.0)
+    return min(max(-at_p / (difference if abs(difference) > 1e-9 else 1e-9), 0.0), 1.0)
+
+
+@njit(**INLINE)
+def crossing_slopes(at_p, at_q):
+    """Derivatives of ``crossing`` by its arguments."""
+    difference = at_q - at_p
+    if abs(difference) <= 1e-9 or not 0.0 <= -at_p / difference <= 1.0:
+        return 0.0, 0.0
+    t = -at_p / difference
+    return (t - 1.0) / difference, -t / difference
 
 
 @dataclass(frozen=True)
@@ -76,23 +92,90 @@ class Jumps:
 
 
 def blended(values: Tensor, parts: list[Jumps]) -> Tensor:
-    """Values of pixels (N, C), those of pairs blended by where the jumps between them lie.
+    """Values of pixels (N, C) float64, those of pairs blended by where the jumps between them lie.
 
     On either side of a jump the values run straight on (or, where nothing is known of them, stay as they are) up to the
     jump, and each pixel is the mean over its width. A jump that passes the middle of a pixel then changes nothing
     suddenly: the pixel takes the other side's value there, which is the same. All parts blend the values as they were.
     """
-    result = values
     for part in parts:
-        p, q = torch.from_numpy(part.pairs.p), torch.from_numpy(part.pairs.q)
-        slope_p = torch.from_numpy(part.smooth_p)[:, None] * (values[p] - values[torch.from_numpy(part.pairs.before)])
-        slope_q = torch.from_numpy(part.smooth_q)[:, None] * (values[torch.from_numpy(part.pairs.after)] - values[q])
-        # Not below zero: what is bright at the rim of a fiber only does not run on.
-        slope_p, slope_q = torch.maximum(slope_p, -values[p]), torch.minimum(slope_q, values[q])
-        # Integral over x from t to 1/2 of what lies beyond the jump minus what lies before it, x counted from p.
-        width = (0.5 - part.t)[:, None]
-        at_p = values[q] - slope_q - values[p]
-        moved = width * (at_p + (slope_q - slope_p) * (0.5 * (part.t + 0.5))[:, None])
-        towards_p = (width > 0.0) * moved
-        result = result.index_add(0, p, towards_p).index_add(0, q, moved - towards_p)
+        if part.t.shape != part.pairs.p.shape:
+            raise ValueError(f"{len(part.pairs.p)} pairs have {tuple(part.t.shape)} jumps")
+    result: Tensor = _Blended.apply(values, parts, *(part.t for part in parts))
     return result
+
+
+class _Blended(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, parts: list[Jumps], *ts: Tensor) -> Tensor:
+        ctx.save_for_backward(values, *ts)
+        ctx.parts = parts
+        old = np.ascontiguousarray(as_numpy(values), dtype=np.float64)
+        new = old.copy()
+        for part, t in zip(parts, ts, strict=True):
+            _blend(*_arguments(part), as_numpy(t), old, new)
+        return torch.from_numpy(new)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, by_result: Tensor) -> tuple[Tensor | None, ...]:
+        values, *ts = ctx.saved_tensors
+        old, given = as_numpy(values), np.ascontiguousarray(as_numpy(by_result))
+        by_values, by_ts = given.copy(), []
+        for part, t in zip(ctx.parts, ts, strict=True):
+            by_t = np.zeros(len(t))
+            _blend_slopes(*_arguments(part), as_numpy(t), old, given, by_values, by_t)
+            by_ts.append(torch.from_numpy(by_t))
+        return torch.from_numpy(by_values), None, *by_ts
+
+
+def _arguments(part: Jumps) -> tuple[NDArray, ...]:
+    pairs = part.pairs
+    return pairs.p, pairs.q, pairs.before, pairs.after, part.smooth_p, part.smooth_q
+
+
+@njit(**KERNEL)
+def _blend(p, q, before, after, smooth_p, smooth_q, t, old, new):
+    for m in range(len(p)):
+        width, middle = 0.5 - t[m], 0.5 * (t[m] + 0.5)
+        target = p[m] if width > 0.0 else q[m]
+        for c in range(old.shape[1]):
+            at_p, at_q = old[p[m], c], old[q[m], c]
+            # Not below zero: what is bright at the rim of a fiber only does not run on.
+            slope_p = max(at_p - old[before[m], c], -at_p) if smooth_p[m] else 0.0
+            slope_q = min(old[after[m], c] - at_q, at_q) if smooth_q[m] else 0.0
+            # Integral over x from t to 1/2 of what lies beyond the jump minus what lies before it, x counted from p.
+            new[target, c] += width * (at_q - slope_q - at_p + (slope_q - slope_p) * middle)
+
+
+@njit(**KERNEL)
+def _blend_slopes(p, q, before, after, smooth_p, smooth_q, t, old, given, by_old, by_t):
+    for m in range(len(p)):
+        width, middle = 0.5 - t[m], 0.5 * (t[m] + 0.5)
+        target = p[m] if width > 0.0 else q[m]
+        for c in range(old.shape[1]):
+            at_p, at_q = old[p[m], c], old[q[m], c]
+            runs_p = smooth_p[m] and at_p - old[before[m], c] >= -at_p
+            runs_q = smooth_q[m] and old[after[m], c] - at_q <= at_q
+            slope_p, slope_q = 0.0, 0.0
+            if smooth_p[m]:
+                slope_p = at_p - old[before[m], c] if runs_p else -at_p
+            if smooth_q[m]:
+                slope_q = old[after[m], c] - at_q if runs_q else at_q
+            g = given[target, c]
+            bend = slope_q - slope_p
+            by_t[m] += g * (0.5 * width * bend - (at_q - slope_q - at_p + bend * middle))
+            g *= width
+            by_p, by_q, by_slope_p, by_slope_q = -g, g, -g * middle, g * (middle - 1.0)
+            if runs_p:
+                by_p += by_slope_p
+                by_old[before[m], c] -= by_slope_p
+            elif smooth_p[m]:
+                by_p -= by_slope_p
+            if runs_q:
+                by_q -= by_slope_q
+                by_old[after[m], c] += by_slope_q
+            elif smooth_q[m]:
+                by_q += by_slope_q
+            by_old[p[m], c] += by_p
+            by_old[q[m], c] += by_q

@@ -1,174 +1,325 @@
-"""Which jumps lie between neighbouring pixels, and where: the geometry behind ``edges``."""
+"""Which jumps between fibers lie between neighbouring pixels, and where: the geometry behind ``edges``.
+
+Either the nearer fiber ends, at its silhouette |h| = 1, or two fibers run into each other. Both are one: a fiber with
+its axis at depth a shows in front of a surface at depth d where its half thickness there, sqrt(1 - h^2) radii, is more
+than (a - d) / radius. So the jump function of the fiber is sqrt(h^2 + max(a - d, 0)^2 / radius^2) - 1.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from typing import Any
 
 import numpy as np
 import torch
+from numba import njit, prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from usdfab.fit.raster.edges import Ints, Jumps, Pairs, crossing
-from usdfab.fit.raster.hits import Gatherer, pass_by
+from usdfab.fit.raster.curves import Polylines, as_numpy
+from usdfab.fit.raster.edges import Jumps, Pairs, crossing, crossing_slopes
+from usdfab.fit.raster.hits import in_units
+from usdfab.fit.raster.segments import (
+    BLOCK,
+    INLINE,
+    SYSTEM,
+    Geometry,
+    add_to_ends,
+    ends_of,
+    pass_by,
+    pass_by_slopes,
+    same_fiber,
+    settled,
+)
 from usdfab.fit.raster.visibility import NOTHING, Seen
+from usdfab.tracer.intrinsics import KERNEL, borrow
 
-Bools = NDArray[np.bool_]
+NONE, P_ENDS, Q_ENDS = 0, 1, 2
+"""Between two pixels: no jump along this line of pixels; one where what p sees ends; or what q sees."""
 
-
-@dataclass(frozen=True)
-class Rays:
-    """The camera rays of a picture, row by row: ``start`` (N, 3) metres near the cloth, ``direction`` (N, 3)."""
-
-    start: NDArray[np.float64]
-    direction: Tensor
-
-
-def jumps(gather: Gatherer, seen: Seen, p: Ints, q: Ints) -> Bools:
-    """(M,) where pixels p and q (M,) do not show the same piece of fiber, nor two that continue each other."""
-    model = gather.model
-    a, b = seen.segment[p].astype(np.int64), seen.segment[q].astype(np.int64)
-    copy_a, copy_b = seen.copy[p], seen.copy[q]
-    same_copy = (copy_a == copy_b).all(axis=1)
-    same = (a == b) & same_copy | (a >= 0) & (b >= 0) & (model.curve[a] == model.curve[b]) & same_copy
-    for one, other, of_one, of_other in ((a, b, copy_a, copy_b), (b, a, copy_b, copy_a)):
-        next_copy = of_one + model.following_shift[one]
-        same |= (one >= 0) & (model.following[one] == other) & (next_copy == of_other).all(axis=1)
-    return ~same
+_TINY = 1e-12
+_LEAST_ROOT = 1e-9
 
 
 def visible_edges(
-    gather: Gatherer, seen: Seen, shadows: list[Seen], rays: Rays, pairs: Pairs, along_row: bool
+    geometry: Geometry, lines: Polylines, seen: Seen, shadows: list[Seen], pairs: Pairs, along_row: bool
 ) -> list[Jumps]:
     """Where between pixels one fiber gives way to another, for ``edges.blended``.
-
-    Either the nearer fiber ends, at its silhouette |h| = 1, or two fibers run into each other. Both are one: a fiber
-    with its axis at depth a shows in front of a surface at depth d where its half thickness there, sqrt(1 - h^2) radii,
-    is more than (a - d) / radius. So the jump function of the fiber is sqrt(h^2 + max(a - d, 0)^2 / radius^2) - 1.
 
     Parameters
     ----------
     pairs:
         All pairs along the rows or, if not ``along_row``, along the columns.
     """
-    pairs = pairs[jumps(gather, seen, pairs.p, pairs.q)]
-    if not len(pairs.p):
+    points, radius = in_units(geometry, lines.points, lines.radius)
+    kinds = classified(geometry, points, radius, seen, pairs, along_row)
+    chosen = np.flatnonzero(kinds)
+    if not len(chosen):
         return []
-    with torch.no_grad():
-        ends, other = _ending(gather, seen, rays, pairs)
-        at_p, at_q, at_r = (_showing(gather, seen, rays, ends, other, at) for at in (pairs.p, pairs.q, pairs.r))
-        row, column = (at_q - at_p).abs(), (at_r - at_p).abs()
-        keep = (row >= column if along_row else row > column).numpy()
-    if not keep.any():
-        return []
-    pairs, ends, other = pairs[keep], ends[keep], other[keep]
-    t = crossing(*(_showing(gather, seen, rays, ends, other, at) for at in (pairs.p, pairs.q)))
-    smooth_p, smooth_q = (
-        (near != far) & ~jumps(gather, seen, near, far) & _alike(shadows, near, far)
-        for near, far in ((pairs.p, pairs.before), (pairs.q, pairs.after))
-    )
+    pairs, kinds = pairs[chosen], kinds[chosen]
+    t: Tensor = _Crossing.apply(lines.points, lines.radius, geometry, seen, pairs, kinds)
+    dark = np.stack([s.segment != NOTHING for s in shadows] or [np.zeros(len(seen.segment), dtype=bool)])
+    smooth_p, smooth_q = np.empty(len(chosen), dtype=np.bool_), np.empty(len(chosen), dtype=np.bool_)
+    _runs_on(geometry.topology, seen.segment, seen.copy, dark, pairs.p, pairs.before, smooth_p)
+    _runs_on(geometry.topology, seen.segment, seen.copy, dark, pairs.q, pairs.after, smooth_q)
     return [Jumps(pairs, t, smooth_p, smooth_q)]
 
 
-def _alike(shadows: list[Seen], p: Ints, q: Ints) -> Bools:
-    """(M,) where the same lamps shine on pixels p and q: colours do not run on past the rim of a shadow."""
-    same = np.ones(len(p), dtype=bool)
-    for shadow in shadows:
-        dark = shadow.segment != NOTHING
-        same &= dark[p] == dark[q]
-    return same
+def classified(
+    geometry: Geometry, points: NDArray, radius: NDArray, seen: Seen, pairs: Pairs, along_row: bool
+) -> NDArray[np.int8]:
+    """(M,) ``NONE``, ``P_ENDS`` or ``Q_ENDS`` for pairs of pixels (M,).
 
-
-def _ending(gather: Gatherer, seen: Seen, rays: Rays, pairs: Pairs) -> tuple[Ints, Ints]:
-    """The pixels of each pair that see the fiber which ends between them, and what it ends in front of.
-
-    It is the fiber that is farther out at the other's pixel, and if both are beyond their sides there, the nearer.
+    A jump counts along the axis to which it is more nearly normal. The fiber that ends is the one that is farther out
+    at the other's pixel, and if both are beyond their sides there, the nearer.
     """
-    nothing_p, nothing_q = seen.segment[pairs.p] == NOTHING, seen.segment[pairs.q] == NOTHING
-    of_a, of_b = np.where(nothing_p, pairs.q, pairs.p), np.where(nothing_q, pairs.p, pairs.q)
-    out_a, out_b = (
-        _profile(gather, seen, rays, of, at)[0].abs().numpy() for of, at in ((of_a, pairs.q), (of_b, pairs.p))
+    kinds = np.zeros(len(pairs.p), dtype=np.int8)
+    _classify(
+        points, radius, geometry.topology, geometry.size, geometry.start, geometry.direction, seen.segment, seen.copy,
+        pairs.p, pairs.q, pairs.r, along_row, kinds,
+    )  # fmt: skip
+    return kinds
+
+
+class _Crossing(torch.autograd.Function):
+    """t (M,) of the jumps between pairs of pixels."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, points: Tensor, radius: Tensor, geometry: Geometry, seen: Seen, pairs: Pairs, kinds: NDArray
+    ) -> Tensor:
+        ctx.save_for_backward(points, radius)
+        t = np.empty(len(kinds))
+        # Segments of what ends and of the other, each settled beside p and q, with their copies.
+        beside = np.empty((4, len(kinds)), dtype=np.int64)
+        copies = np.empty((4, len(kinds), 2), dtype=np.int64)
+        _cross(
+            *in_units(geometry, points, radius), geometry.topology, geometry.size, geometry.start, geometry.direction,
+            seen.segment, seen.copy, pairs.p, pairs.q, kinds, beside, copies, t,
+        )  # fmt: skip
+        ctx.geometry, ctx.pairs, ctx.beside, ctx.copies = geometry, pairs, beside, copies
+        return torch.from_numpy(t)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, by_t: Tensor) -> tuple[Tensor | None, ...]:
+        points, radius = ctx.saved_tensors
+        geometry: Geometry = ctx.geometry
+        by_points, by_radius = np.zeros(tuple(points.shape)), np.zeros(2)
+        _cross_slopes(
+            *in_units(geometry, points, radius), geometry.topology, geometry.size, geometry.start, geometry.direction,
+            ctx.pairs.p, ctx.pairs.q, ctx.beside, ctx.copies, np.ascontiguousarray(as_numpy(by_t)),
+            by_points, by_radius,
+        )  # fmt: skip
+        by_points, by_radius = by_points / geometry.scale, by_radius / geometry.scale
+        return torch.from_numpy(by_points), torch.from_numpy(by_radius), None, None, None, None
+
+
+@njit(**INLINE)
+def _profile(points, radius, topology, size, start, direction, segment, i, j, at):
+    """h of a fiber from the ray of pixel ``at``, the depth of its axis, its radius along the ray; and the segment.
+
+    Depths are below the cloth's plane, which the rays of all pixels have in common.
+    """
+    ox, oy, oz = start[at, 0], start[at, 1], start[at, 2]
+    dx, dy, dz = direction[at, 0], direction[at, 1], direction[at, 2]
+    segment, i, j = settled(points, radius, topology, size, segment, i, j, ox, oy, oz, dx, dy, dz)
+    ends = ends_of(points, topology, size, segment, i, j, ox, oy, oz)
+    h, middle, half = pass_by(ends, radius[topology[segment, SYSTEM]], dx, dy, dz)
+    return h, -dz * middle, -dz * half, segment, i, j
+
+
+@njit(**INLINE)
+def _depth(h, axis, unit):
+    """Of a fiber's surface; beyond its sides, of the sides."""
+    return axis - unit * math.sqrt(max(1.0 - h * h, _LEAST_ROOT))
+
+
+@njit(**INLINE)
+def _showing(h, axis, unit, behind):
+    """The jump function of a fiber before a surface at depth ``behind``."""
+    sunk = max((axis - behind) / unit, 0.0)
+    return math.sqrt(h * h + sunk * sunk + _TINY) - 1.0
+
+
+@njit(**KERNEL, parallel=True)
+def _classify(points_, radius_, topology_, size_, start_, direction_, segment_, copy_, p, q, r, along_row, kinds):
+    count = len(p)
+    for block in prange((count + BLOCK - 1) // BLOCK):
+        points, radius, topology, size = borrow(points_), borrow(radius_), borrow(topology_), borrow(size_)
+        start, direction, segment, copy = borrow(start_), borrow(direction_), borrow(segment_), borrow(copy_)
+        for m in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
+            at_p, at_q = p[m], q[m]
+            if not same_fiber(topology, segment, copy, at_p, at_q):
+                kinds[m] = _kind(
+                    points, radius, topology, size, start, direction, segment, copy, at_p, at_q, r[m], along_row
+                )
+
+
+@njit(**KERNEL)
+def _kind(points, radius, topology, size, start, direction, segment, copy, p, q, r, along_row):
+    a, b = np.int64(segment[p]), np.int64(segment[q])
+    if a < 0 or b < 0:
+        # One of them sees nothing behind: the other ends.
+        of = q if a < 0 else p
+        s, i, j = np.int64(segment[of]), np.int64(copy[of, 0]), np.int64(copy[of, 1])
+        at_p = _profile(points, radius, topology, size, start, direction, s, i, j, p)
+        at_q = _profile(points, radius, topology, size, start, direction, s, i, j, q)
+        at_r = _profile(points, radius, topology, size, start, direction, s, i, j, r)
+        here, row, column = math.sqrt(at_p[0] ** 2 + _TINY), at_q[0], at_r[0]
+        row, column = abs(math.sqrt(row * row + _TINY) - here), abs(math.sqrt(column * column + _TINY) - here)
+        keep = row >= column if along_row else row > column
+        return (Q_ENDS if a < 0 else P_ENDS) if keep else NONE
+    i, j = np.int64(copy[p, 0]), np.int64(copy[p, 1])
+    a_p = _profile(points, radius, topology, size, start, direction, a, i, j, p)
+    a_q = _profile(points, radius, topology, size, start, direction, a, i, j, q)
+    a_r = _profile(points, radius, topology, size, start, direction, a, i, j, r)
+    i, j = np.int64(copy[q, 0]), np.int64(copy[q, 1])
+    b_p = _profile(points, radius, topology, size, start, direction, b, i, j, p)
+    b_q = _profile(points, radius, topology, size, start, direction, b, i, j, q)
+    b_r = _profile(points, radius, topology, size, start, direction, b, i, j, r)
+    out_a, out_b = abs(a_q[0]), abs(b_p[0])
+    if out_a > 1.0 and out_b > 1.0:
+        a_ends = _depth(a_p[0], a_p[1], a_p[2]) <= _depth(b_q[0], b_q[1], b_q[2])
+    else:
+        a_ends = out_a > out_b
+    if not a_ends:
+        a_p, a_q, a_r, b_p, b_q, b_r = b_p, b_q, b_r, a_p, a_q, a_r
+    here = _showing(a_p[0], a_p[1], a_p[2], _depth(b_p[0], b_p[1], b_p[2]))
+    row = abs(_showing(a_q[0], a_q[1], a_q[2], _depth(b_q[0], b_q[1], b_q[2])) - here)
+    column = abs(_showing(a_r[0], a_r[1], a_r[2], _depth(b_r[0], b_r[1], b_r[2])) - here)
+    keep = row >= column if along_row else row > column
+    return (P_ENDS if a_ends else Q_ENDS) if keep else NONE
+
+
+@njit(**KERNEL, parallel=True)
+def _cross(
+    points_, radius_, topology_, size_, start_, direction_, segment, copy, p, q, kinds, beside, copies, t
+):  # fmt: skip
+    count = len(p)
+    for block in prange((count + BLOCK - 1) // BLOCK):
+        points, radius, topology, size = borrow(points_), borrow(radius_), borrow(topology_), borrow(size_)
+        start, direction = borrow(start_), borrow(direction_)
+        for m in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
+            one, other = (p[m], q[m]) if kinds[m] == P_ENDS else (q[m], p[m])
+            a, i, j = np.int64(segment[one]), np.int64(copy[one, 0]), np.int64(copy[one, 1])
+            b, k, n = np.int64(segment[other]), np.int64(copy[other, 0]), np.int64(copy[other, 1])
+            first = second = 0.0
+            for side in range(2):
+                at = p[m] if side == 0 else q[m]
+                h, axis, unit, s, x, y = _profile(points, radius, topology, size, start, direction, a, i, j, at)
+                beside[side, m], copies[side, m, 0], copies[side, m, 1] = s, x, y
+                behind = math.inf
+                beside[2 + side, m] = NOTHING
+                if b >= 0:
+                    ho, axis_o, unit_o, s, x, y = _profile(
+                        points, radius, topology, size, start, direction, b, k, n, at
+                    )  # fmt: skip
+                    beside[2 + side, m], copies[2 + side, m, 0], copies[2 + side, m, 1] = s, x, y
+                    behind = _depth(ho, axis_o, unit_o)
+                first, second = second, _showing(h, axis, unit, behind)
+            t[m] = crossing(first, second)
+
+
+_CHUNK = 32 * BLOCK
+"""Pairs whose derivatives are kept before they are added to those by vertices."""
+
+
+@njit(**KERNEL, parallel=True)
+def _cross_slopes(
+    points_, radius_, topology_, size_, start_, direction_, p, q, beside, copies, by_t, by_points, by_radius
+):  # fmt: skip
+    count = len(p)
+    ends_slopes, radius_slopes = np.empty((4, _CHUNK, 6)), np.empty((4, _CHUNK))
+    for base in range(0, count, _CHUNK):
+        rows = min(count - base, _CHUNK)
+        for block in prange((rows + BLOCK - 1) // BLOCK):
+            points, radius, topology, size = borrow(points_), borrow(radius_), borrow(topology_), borrow(size_)
+            start, direction = borrow(start_), borrow(direction_)
+            for row in range(block * BLOCK, min(rows, (block + 1) * BLOCK)):
+                m = base + row
+                first = _showing_beside(points, radius, topology, size, start, direction, beside, copies, m, 0, p[m])
+                second = _showing_beside(points, radius, topology, size, start, direction, beside, copies, m, 1, q[m])
+                by_first, by_second = crossing_slopes(first, second)
+                for side in range(2):
+                    _showing_slopes(
+                        points, radius, topology, size, start, direction, beside, copies, m, side,
+                        p[m] if side == 0 else q[m], by_t[m] * (by_first if side == 0 else by_second),
+                        row, ends_slopes, radius_slopes,
+                    )  # fmt: skip
+        for which in range(4):
+            add_to_ends(
+                rows, topology_, beside[which, base : base + rows], ends_slopes[which], radius_slopes[which],
+                by_points, by_radius,
+            )  # fmt: skip
+
+
+@njit(**INLINE)
+def _settled_profile(points, radius, topology, size, start, direction, beside, copies, m, which, at):
+    s = beside[which, m]
+    ends = ends_of(
+        points, topology, size, s, copies[which, m, 0], copies[which, m, 1], start[at, 0], start[at, 1], start[at, 2]
     )
-    depth_a, depth_b = (_depth(*_profile(gather, seen, rays, of, of)).numpy() for of in (of_a, of_b))
-    a_ends = np.where((out_a > 1.0) & (out_b > 1.0), depth_a <= depth_b, out_a > out_b)
-    a_ends = nothing_q | ~nothing_p & a_ends
-    return np.where(a_ends, pairs.p, pairs.q), np.where(a_ends, pairs.q, pairs.p)
+    thick = radius[topology[s, SYSTEM]]
+    h, middle, half = pass_by(ends, thick, direction[at, 0], direction[at, 1], direction[at, 2])
+    down = -direction[at, 2]
+    return h, down * middle, down * half, ends, thick
 
 
-def _showing(gather: Gatherer, seen: Seen, rays: Rays, ends: Ints, other: Ints, at: Ints) -> Tensor:
-    """The jump function of the fibers that pixels ``ends`` see before those that ``other`` see, at pixels ``at``."""
-    h, axis, unit = _profile(gather, seen, rays, ends, at)
-    solid = np.flatnonzero(seen.segment[other] != NOTHING)
-    rows = torch.from_numpy(solid)
-    behind = _depth(*_profile(gather, seen, rays, other[solid], at[solid]))
-    sunk = torch.zeros_like(h).index_copy(0, rows, ((axis[rows] - behind) / unit[rows]).clamp_min(0.0))
-    return torch.sqrt(h * h + sunk * sunk + 1e-12) - 1.0
+@njit(**INLINE)
+def _showing_beside(points, radius, topology, size, start, direction, beside, copies, m, side, at):
+    """The jump function at pixel ``at``, which is p (side 0) or q (1)."""
+    h, axis, unit, _, _ = _settled_profile(
+        points, radius, topology, size, start, direction, beside, copies, m, side, at
+    )  # fmt: skip
+    behind = math.inf
+    if beside[2 + side, m] >= 0:
+        ho, axis_o, unit_o, _, _ = _settled_profile(
+            points, radius, topology, size, start, direction, beside, copies, m, 2 + side, at
+        )
+        behind = _depth(ho, axis_o, unit_o)
+    return _showing(h, axis, unit, behind)
 
 
-def _profile(gather: Gatherer, seen: Seen, rays: Rays, of: Ints, at: Ints) -> tuple[Tensor, Tensor, Tensor]:
-    """h of the fibers that pixels ``of`` see from the rays of pixels ``at``, the depth of their axes, their radii.
+@njit(**KERNEL)
+def _showing_slopes(
+    points, radius, topology, size, start, direction, beside, copies, m, side, at, by_showing, row, ends_slopes,
+    radius_slopes,
+):  # fmt: skip
+    """Derivatives of a loss by the segments at pixel ``at``, from that by the jump function there."""
+    h, axis, unit, ends, thick = _settled_profile(
+        points, radius, topology, size, start, direction, beside, copies, m, side, at
+    )
+    dx, dy, dz = direction[at, 0], direction[at, 1], direction[at, 2]
+    by_axis = by_unit = 0.0
+    if beside[2 + side, m] >= 0:
+        ho, axis_o, unit_o, ends_o, thick_o = _settled_profile(
+            points, radius, topology, size, start, direction, beside, copies, m, 2 + side, at
+        )
+        root = math.sqrt(max(1.0 - ho * ho, _LEAST_ROOT))
+        sunk = max((axis - axis_o + unit_o * root) / unit, 0.0)
+        norm = math.sqrt(h * h + sunk * sunk + _TINY)
+        by_sunk = by_showing * sunk / norm
+        by_axis, by_unit = by_sunk / unit, -by_sunk * sunk / unit
+        by_ho = -by_axis * unit_o * ho / root if 1.0 - ho * ho > _LEAST_ROOT else 0.0
+        found = pass_by_slopes(ends_o, thick_o, dx, dy, dz, by_ho, by_axis * dz, -by_axis * root * dz)
+        for c in range(6):
+            ends_slopes[2 + side, row, c] = found[c]
+        radius_slopes[2 + side, row] = found[6]
+    else:
+        norm = math.sqrt(h * h + _TINY)
+    found = pass_by_slopes(ends, thick, dx, dy, dz, by_showing * h / norm, -by_axis * dz, -by_unit * dz)
+    for c in range(6):
+        ends_slopes[side, row, c] = found[c]
+    radius_slopes[side, row] = found[6]
 
-    Depths are below the cloth's plane, which the rays of all pixels have in common; radii as long as along the ray.
-    """
-    direction = rays.direction[torch.from_numpy(at)]
-    s = gather.beside(seen, rays.start[at], direction, of)
-    down = -direction[:, 2]
-    h, middle, half = pass_by(s, direction)
-    return h, middle * down, half * down
 
-
-def _depth(h: Tensor, axis: Tensor, unit: Tensor) -> Tensor:
-    """Of the surface; beyond the sides, of the sides."""
-    return axis - unit * torch.sqrt((1.0 - h * h).clamp_min(1e-9))
-
-
-def shadow_edges(
-    gather: Gatherer,
-    seen: Seen,
-    shadow: Seen,
-    rays: Rays,
-    places: Tensor,
-    lamp: NDArray[np.float64],
-    pairs: Pairs,
-    along_row: bool,
-) -> list[Jumps]:
-    """Rims of one lamp's shadows between pixels of the same fiber, for ``edges.blended``.
-
-    Parameters
-    ----------
-    places: (N, 3)
-        Where the camera rays meet fibers, relative to ``rays.start``, in units; any where they do not.
-    lamp: (3,) metres
-    """
-    dark = shadow.segment != NOTHING
-    on_fiber = seen.segment[pairs.p] != NOTHING
-    pairs = pairs[(dark[pairs.p] != dark[pairs.q]) & on_fiber & ~jumps(gather, seen, pairs.p, pairs.q)]
-    if not len(pairs.p):
-        return []
-    owner = np.where(dark[pairs.p], pairs.p, pairs.q)
-    lit = np.where(dark[pairs.p], pairs.q, pairs.p)
-
-    def cast(at: NDArray[np.int64]) -> Tensor:
-        """h of the caster of the shadow, along the ray from what pixel ``at`` sees to the lamp."""
-        place = places[torch.from_numpy(at)]
-        to_lamp = torch.from_numpy((lamp - rays.start[at]) / gather.scale).to(gather.dtype) - place
-        to_lamp = to_lamp / torch.linalg.norm(to_lamp, dim=-1, keepdim=True)
-        origin = rays.start[at] + gather.scale * place.detach().numpy()
-        s = gather.beside(shadow, origin, to_lamp.detach(), owner)
-        # ``origin`` carries no gradient: what is left of the place is zero, but its gradient is not.
-        rest = place - place.detach()
-        return pass_by(s._replace(start=s.start - rest, end=s.end - rest), to_lamp)[0]
-
-    with torch.no_grad():
-        # At r another fiber may be seen: then nothing tells how the rim runs, and rows take it.
-        same = ~jumps(gather, seen, pairs.p, pairs.r) & (seen.segment[pairs.r] != NOTHING)
-        here = cast(pairs.p)
-        row, column = (cast(pairs.q) - here).abs(), (cast(np.where(same, pairs.r, pairs.p)) - here).abs()
-        keep = (row >= column if along_row else row > column).numpy() & (same | along_row)
-        sign = torch.sign(cast(lit))[torch.from_numpy(keep)]
-    pairs, owner, lit = pairs[keep], owner[keep], lit[keep]
-    if not len(pairs.p):
-        return []
-    # Light and shadow are the same everywhere on their sides of the rim: nothing runs on.
-    flat = np.zeros(len(pairs.p), dtype=bool)
-    return [Jumps(pairs, crossing(sign * cast(pairs.p) - 1.0, sign * cast(pairs.q) - 1.0), flat, flat)]
+@njit(**KERNEL)
+def _runs_on(topology, segment, copy, dark, near, far, result):
+    """Where pixels ``far`` show what ``near`` show, under the same lamps: colours do not run on past a shadow's rim."""
+    for m in range(len(near)):
+        a, b = near[m], far[m]
+        same = a != b and same_fiber(topology, segment, copy, a, b)
+        for lamp in range(len(dark)):
+            same = same and dark[lamp, a] == dark[lamp, b]
+        result[m] = same

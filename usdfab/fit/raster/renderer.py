@@ -14,12 +14,13 @@ from usdfab.fabric.optics import optics_of
 from usdfab.fibers.patch import RASTERIZATION_VERTICES
 from usdfab.fit.raster.curves import CurveModel, Polylines, Shapes, as_numpy, raster_copies
 from usdfab.fit.raster.edges import blended, pixel_pairs
-from usdfab.fit.raster.hits import Gatherer, Meeting, dot, meet
-from usdfab.fit.raster.jumps import Rays, shadow_edges, visible_edges
-from usdfab.fit.raster.shade import Look, Surface, piece_count, pieces, radiance
+from usdfab.fit.raster.hits import Meeting, meet
+from usdfab.fit.raster.jumps import visible_edges
+from usdfab.fit.raster.segments import geometry_of
+from usdfab.fit.raster.shade import Lighting, Look, cuticle_turns, materials, shaded
+from usdfab.fit.raster.shadows import shadow_edges
 from usdfab.fit.raster.view import View, view_of
 from usdfab.fit.raster.visibility import NOTHING, Seen, index_patch, look
-from usdfab.scattering.fiber_torch import pack_fiber
 from usdfab.usd.scene import Camera, Scene
 
 PATCH_CELLS = 6
@@ -31,8 +32,8 @@ class RasterSettings:
     """How to rasterize.
 
     ``size`` (width, height) of the picture; ``supersampling`` squared pixels make one of them (the paper: 2 x 2).
-    ``single``, ``diffuse``, ``shadows``, ``edges`` switch off parts, for ablations. ``float64`` computes pixels in
-    double precision, for gradient checks.
+    ``single``, ``diffuse``, ``shadows``, ``edges`` switch off parts, for ablations. ``float64`` gives the picture in
+    double precision, in which it is computed, for gradient checks.
     """
 
     size: tuple[int, int]
@@ -65,16 +66,20 @@ class RasterRenderer:
         n = settings.supersampling
         self._shape = settings.size[1] * n, settings.size[0] * n
         self._view: View = view_of(scene, camera, (self._shape[1], self._shape[0]))
-        self._dtype = torch.float64 if settings.float64 else torch.float32
         directions = self._view.directions.reshape(-1, 3)
         start = self._view.eye - (self._view.eye[2] / directions[:, 2:]) * directions
-        self._directions = directions
-        self._rays = Rays(start, torch.from_numpy(directions).to(self._dtype))
         self._pairs = pixel_pairs(*self._shape)
-        self._scale = min(s.radius for s in self.model._systems)
+        scale = min(s.radius for s in self.model._systems)
+        self._geometry = geometry_of(self.model, start, directions, scale)
         # Width of a pixel on the cloth's plane, across the ray.
         steps = np.linalg.norm(np.diff(start.reshape(*self._shape, 3), axis=1), axis=-1)
-        self._pixel = float(np.median(steps)) / self._scale
+        self._pixel = float(np.median(steps)) / scale
+        self._color_system = optics_of(fabric).system
+        self._lighting = Lighting(
+            self._view.lamps / scale, self._view.intensity / scale**2,
+            cuticle_turns((fabric.warp.cuticle_tilt, fabric.weft.cuticle_tilt), self._color_system),
+            settings.single, settings.diffuse,
+        )  # fmt: skip
 
     def look_of(self, diffuse: float | np.ndarray = 0.3) -> Look:
         """The optical parameters of the fabric itself as float64 tensors, with k_d ``diffuse`` ((K, 3) or one)."""
@@ -89,84 +94,42 @@ class RasterRenderer:
         pixels = self.pixels(lines, look_)
         height, width = self._shape
         n = self.settings.supersampling
-        return pixels.reshape(height // n, n, width // n, n, 3).mean(dim=(1, 3))
+        small = pixels.reshape(height // n, n, width // n, n, 3).mean(dim=(1, 3))
+        return small.to(torch.float64 if self.settings.float64 else torch.float32)
 
     def pixels(self, lines: Polylines, look_: Look) -> Tensor:
-        """The picture before it is filtered down, (H n * W n, 3)."""
+        """The picture before it is filtered down, (H n * W n, 3) float64."""
         index = index_patch(self.model, as_numpy(lines.points), as_numpy(lines.radius))
         lamps = self._view.lamps if self.settings.shadows else self._view.lamps[:0]
-        seen, shadows = look(index, self._view.eye, self._directions, lamps)
-        hit = np.flatnonzero(seen.segment != NOTHING)
-        gather = Gatherer(self.model, lines, self._scale, self._dtype)
-        segments = gather(seen, self._rays.start[hit], hit)
-        direction = self._rays.direction[torch.from_numpy(hit)]
-        met = meet(segments, direction)
-        lit = self._lit(gather, seen, shadows, hit, met)
-        spread = self._pixel / segments.radius
-        colors = self._shaded(seen, hit, Surface(met.tangent, met.h, direction, spread), met, lit, look_)
-        flat = torch.zeros(len(self._directions), 3, dtype=self._dtype).index_copy(0, torch.from_numpy(hit), colors)
+        geometry = self._geometry
+        seen, shadows = look(index, self._view.eye, geometry.direction, lamps)
+        met = meet(geometry, lines, seen)
+        lit = self._lit(lines, met, seen, shadows)
+        spread = self._pixel * geometry.scale / lines.radius
+        flat = shaded(geometry, seen, met, lit, spread, materials(look_, self._color_system), self._lighting)
         if self.settings.edges:
             parts = []
             for pairs, along_row in zip(self._pairs, (True, False), strict=True):
-                parts += visible_edges(gather, seen, shadows, self._rays, pairs, along_row)
+                parts += visible_edges(geometry, lines, seen, shadows, pairs, along_row)
             flat = blended(flat, parts)
-        return (self._view.gain * look_.gain).to(self._dtype) * flat
+        return self._view.gain * look_.gain * flat
 
-    def _lit(self, gather: Gatherer, seen: Seen, shadows: list[Seen], hit: np.ndarray, met: Meeting) -> Tensor:
-        """(hits, lamps): how much of each lamp shines there."""
+    def _lit(self, lines: Polylines, met: Meeting, seen: Seen, shadows: list[Seen]) -> Tensor:
+        """(N, lamps): how much of each lamp shines there."""
         if not shadows:
-            return torch.ones(len(hit), len(self._view.lamps), dtype=self._dtype)
-        rows = torch.from_numpy(hit)
-        places = torch.zeros(len(self._directions), 3, dtype=self._dtype).index_copy(
-            0, rows, met.distance[:, None] * self._rays.direction[rows]
-        )
+            return torch.ones(len(met.h), len(self._view.lamps), dtype=torch.float64)
         columns = []
         for shadow, lamp in zip(shadows, self._view.lamps, strict=True):
-            shines = torch.from_numpy(shadow.segment == NOTHING).to(self._dtype)[:, None]
+            shines = torch.from_numpy((shadow.segment == NOTHING).astype(np.float64))[:, None]
             if self.settings.edges:
                 parts = []
                 for pairs, along_row in zip(self._pairs, (True, False), strict=True):
-                    parts += shadow_edges(gather, seen, shadow, self._rays, places, lamp, pairs, along_row)
+                    parts += shadow_edges(
+                        self._geometry, lines, met.distance, seen, shadow, lamp, pairs, along_row
+                    )  # fmt: skip
                 shines = blended(shines, parts)
-            columns.append(shines[rows, 0])
-        return torch.stack(columns, dim=1)
-
-    def _shaded(self, seen: Seen, hit: np.ndarray, surface: Surface, met: Meeting, lit: Tensor, look_: Look) -> Tensor:
-        """(hits, 3) radiance."""
-        segment = seen.segment[hit]
-        system, color = self.model.system[segment], self.model.color[segment]
-        total = torch.zeros(len(hit), 3, dtype=self._dtype)
-        starts = self._rays.start[hit]
-        place = met.distance[:, None] * surface.ray
-        for row in range(len(look_.albedo)):
-            mine = np.flatnonzero(color == row)
-            if not len(mine):
-                continue
-            k = int(system[mine[0]])
-            rough = look_.roughness[k].to(self._dtype)
-            material = pack_fiber(
-                look_.albedo[row].to(self._dtype), rough[0], rough[1], rough[2], look_.ior[k].to(self._dtype),
-                self.fabric.system("weft" if k else "warp").cuticle_tilt,
-            )  # fmt: skip
-            diffuse = look_.diffuse[row].to(self._dtype)
-            for lamp, position in enumerate(self._view.lamps):
-                bright = mine[as_numpy(lit[:, lamp])[mine] > 0.0]
-                number = piece_count(surface.only(torch.from_numpy(bright))).numpy()
-                for count in np.unique(number):
-                    some = bright[number == count]
-                    rows = torch.from_numpy(some)
-                    offset = torch.from_numpy((position - starts[some]) / self._scale).to(self._dtype) - place[rows]
-                    squared = dot(offset, offset)
-                    to_lamp = offset / torch.sqrt(squared)[:, None]
-                    light = torch.zeros(len(some), 3, dtype=self._dtype)
-                    for piece, share in pieces(surface.only(rows), int(count)):
-                        light = light + share[:, None] * radiance(
-                            material if self.settings.single else None, diffuse if self.settings.diffuse else None,
-                            piece, to_lamp, lit[rows, lamp],
-                        )  # fmt: skip
-                    intensity = torch.from_numpy(self._view.intensity[lamp] / self._scale**2).to(self._dtype)
-                    total = total.index_add(0, rows, light * intensity / squared[:, None])
-        return total
+            columns.append(shines)
+        return torch.cat(columns, dim=1)
 
 
 def raster_renderer(scene: Scene, settings: RasterSettings) -> RasterRenderer:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from usdfab.fit.raster.hits import dot
-from usdfab.scattering.fiber_torch import PackedFiber, eval_fiber
-
-DIFFUSE_WEIGHT = 0.5
-"""w_d of eq. 10: how much of the diffuse term follows the fiber's normal, the rest that of the cloth."""
+from usdfab.fit.raster.curves import as_numpy
+from usdfab.fit.raster.hits import Meeting
+from usdfab.fit.raster.segments import Floats, Geometry
+from usdfab.fit.raster.shade_kernel import shade, shade_slopes
+from usdfab.fit.raster.visibility import Seen
+from usdfab.scattering.fiber_numba_wide import tilts
+from usdfab.scattering.fiber_torch import pack_fiber
 
 
 @dataclass(frozen=True)
@@ -39,80 +40,84 @@ class Look:
     gain: Tensor
 
 
-class Surface(NamedTuple):
-    """Fibers at N hits: unit tangent (N, 3), offset h (N,), direction of the camera ray (N, 3), and how wide the pixel
-    is in h (N,)."""
-
-    tangent: Tensor
-    h: Tensor
-    ray: Tensor
-    spread: Tensor
-
-    def only(self, rows: Tensor) -> Surface:
-        """Of some of the hits."""
-        return Surface(self.tangent[rows], self.h[rows], self.ray[rows], self.spread[rows])
-
-
-PIECE = 0.45
-"""Widest part of a fiber, in the angle gamma = arc sine of h, over which attenuation and normal count as constant."""
-
-
-def piece_count(surface: Surface) -> Tensor:
-    """(N,) int64: into how many parts ``pieces`` should cut what pixels see; near a fiber's side, where most changes,
-    more."""
-    low, high = _gammas(surface)
-    return torch.ceil((high - low).detach() / PIECE).clamp_min(1.0).to(torch.int64)
-
-
-def pieces(surface: Surface, number: int) -> list[tuple[Surface, Tensor]]:
-    """What pixels see of the fibers' width, cut into parts of equal angle, and their shares (N,) of it, sum 1."""
-    low, high = _gammas(surface)
-    bounds = [torch.sin(low + (high - low) * (k / number)) for k in range(number + 1)]
-    width = bounds[-1] - bounds[0]
-    return [(surface._replace(h=0.5 * (a + b), spread=b - a), (b - a) / width) for a, b in itertools.pairwise(bounds)]
-
-
-def _gammas(surface: Surface) -> tuple[Tensor, Tensor]:
-    """The range of the angle gamma that pixels see."""
-    low, high = ((surface.h + side * surface.spread).clamp(-1.0 + 1e-6, 1.0 - 1e-6) for side in (-0.5, 0.5))
-    return torch.asin(low), torch.asin(high)
-
-
-def radiance(
-    material: PackedFiber | None, diffuse: Tensor | None, surface: Surface, to_lamp: Tensor, lit: Tensor
-) -> Tensor:
-    """Light of one lamp of intensity 1 that goes back along the camera ray, (N, 3), times the squared distance.
+@dataclass(frozen=True, eq=False)
+class Lighting:
+    """What stays fixed in a picture's shading.
 
     Parameters
     ----------
-    material:
-        Of the fibers, or None without single scattering.
-    diffuse: (3,) or (N, 3) or None
-        k_d.
-    to_lamp: (N, 3)
-        Unit vectors.
-    lit: (N,)
-        How much of the lamp is seen, from 0 to 1.
+    lamps: (L, 3)
+        Places, in units of the geometry.
+    intensity: (L, 3)
+        Radiant intensity over the square of a unit.
+    turn: (K, TILTS_SIZE)
+        The cuticle tilts of all colours, of ``tilts``.
+    single, diffuse:
+        Which parts of the model count.
     """
-    tangent, h, ray, spread = surface
-    sin_to = -dot(ray, tangent)
-    sin_ti = dot(to_lamp, tangent)
-    # Frame of the normal plane: e along wo projected into it, f = axis x e.
-    f = torch.linalg.cross(ray, tangent, dim=-1)
-    f = f / torch.sqrt(dot(f, f) + 1e-12)[:, None]
-    e = torch.linalg.cross(f, tangent, dim=-1)
-    along_e, along_f = dot(to_lamp, e), dot(to_lamp, f)
-    result = torch.zeros((), dtype=ray.dtype)
-    if material is not None:
-        cos_to = torch.sqrt((1.0 - sin_to**2).clamp_min(1e-8))
-        cos_ti = torch.sqrt((along_e**2 + along_f**2).clamp_min(1e-8))
-        # The direction exactly along the fiber has no azimuth, and no gradient of it.
-        phi = torch.atan2(along_f, torch.where(along_e.abs() + along_f.abs() > 1e-6, along_e, 1e-6))
-        result = result + eval_fiber(material, h, sin_to, cos_to, sin_ti, cos_ti, phi, spread)
-    if diffuse is not None:
-        inner = h.clamp(-1.0 + 1e-6, 1.0 - 1e-6)
-        fiber_cos = (torch.sqrt(1.0 - inner**2) * along_e - inner * along_f).clamp_min(0.0)
-        cloth_cos = to_lamp[:, 2].clamp_min(0.0)
-        cosine = DIFFUSE_WEIGHT * fiber_cos + (1.0 - DIFFUSE_WEIGHT) * cloth_cos
-        result = result + diffuse * (cosine / math.pi)[:, None]
-    return result * lit[:, None]
+
+    lamps: Floats
+    intensity: Floats
+    turn: Floats
+    single: bool
+    diffuse: bool
+
+
+def materials(look: Look, system: np.ndarray) -> Tensor:
+    """(K, MATERIAL) constants of all colours; ``system`` (K,) is 0 for the warp's, 1 for the weft's."""
+    which = torch.from_numpy(np.asarray(system, dtype=np.int64))
+    rough = look.roughness[which]
+    p = pack_fiber(look.albedo, rough[:, 0:1], rough[:, 1:2], rough[:, 2:3], look.ior[which][:, None])
+    return torch.cat([p.sigma, p.eta, p.inv_s, p.d_scale, *p.inv_v, *p.m_scale, look.diffuse], dim=1)
+
+
+def cuticle_turns(tilt: tuple[float, float], system: np.ndarray) -> Floats:
+    """``Lighting.turn`` of the tilts (warp, weft), rad."""
+    return np.stack([tilts(tilt[k]) for k in system])
+
+
+def shaded(
+    geometry: Geometry, seen: Seen, met: Meeting, lit: Tensor, spread: Tensor, material: Tensor, lighting: Lighting
+) -> Tensor:
+    """(N, 3) radiance of a picture's pixels, 0 where they see nothing.
+
+    Parameters
+    ----------
+    lit: (N, L)
+        How much of each lamp shines there.
+    spread: (2,)
+        Width of a pixel in h on warp and weft.
+    material: (K, MATERIAL)
+        Of ``materials``.
+    """
+    result: Tensor = _Shaded.apply(met.distance, met.tangent, met.h, lit, spread, material, geometry, seen, lighting)
+    return result
+
+
+class _Shaded(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, distance: Tensor, tangent: Tensor, h: Tensor, lit: Tensor, spread: Tensor, material: Tensor,
+        geometry: Geometry, seen: Seen, lighting: Lighting,
+    ) -> Tensor:  # fmt: skip
+        ctx.save_for_backward(distance, tangent, h, lit, spread, material)
+        ctx.fixed = geometry, seen, lighting
+        colors = np.zeros((len(distance), 3))
+        shade(*_arguments((distance, tangent, h, lit, spread, material), *ctx.fixed), colors)
+        return torch.from_numpy(colors)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, by_colors: Tensor) -> tuple[Tensor | None, ...]:
+        given = np.ascontiguousarray(as_numpy(by_colors))
+        results = [np.zeros(tuple(t.shape)) for t in ctx.saved_tensors]
+        shade_slopes(*_arguments(ctx.saved_tensors, *ctx.fixed), given, *results)
+        return *(torch.from_numpy(r) for r in results), None, None, None
+
+
+def _arguments(tensors: tuple[Tensor, ...], geometry: Geometry, seen: Seen, lighting: Lighting) -> tuple[Any, ...]:
+    return (
+        *(np.ascontiguousarray(as_numpy(t)) for t in tensors), geometry.topology, geometry.color, geometry.start,
+        geometry.direction, seen.segment, lighting.lamps, lighting.intensity, lighting.turn, lighting.single,
+        lighting.diffuse,
+    )  # fmt: skip
