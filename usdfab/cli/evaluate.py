@@ -10,7 +10,7 @@ from usdfab.errors import UsdfabError
 
 
 def run(
-    what: Literal["photos", "losses", "raster", "ablation", "path"],
+    what: Literal["photos", "fits", "losses", "raster", "ablation", "path"],
     folder: Path | None = None,
     /,
     *,
@@ -23,6 +23,7 @@ def run(
     fibers: int | None = None,
     output: OptionalOutput = None,
     overwrite: Overwrite = False,
+    stages: str = "analysis,match",
     json: Json = False,
 ) -> None:
     """Judge usdfab's estimates on labelled photos or random fabrics, or the losses of the fit, and print a table.
@@ -30,6 +31,7 @@ def run(
     Usage examples:
 
         usdfab evaluate photos FOLDER
+        usdfab evaluate fits FOLDER -o fits --stages analysis,match --quality draft
         usdfab evaluate losses FOLDER
         usdfab evaluate raster --count 1 --fibers 40
         usdfab evaluate ablation --fibers 40 -o ablation
@@ -38,12 +40,14 @@ def run(
     Parameters
     ----------
     what:
-        photos: the analysis stage on real cloth. losses: which texture statistics tell fabrics apart (needs the fit
-        extra). raster, path: how well that stage recovers random fabrics of each weave from 20 % off (slow: a
-        fit for each; needs the fit extra). ablation: what the raster stage finds without parts of its shading, its
-        losses and its prior, as in figures 15, 17 and 18 of Li et al. 2024 (ten fits; needs the fit extra).
+        photos: the analysis stage on real cloth. fits: how near fits come to their photos, with a picture of each; the
+        same command goes on with a run that was broken off (needs the fit extra). losses: which texture statistics
+        tell fabrics apart (needs the fit extra). raster, path: how well that stage recovers random fabrics of each
+        weave from 20 % off (slow: a fit for each; needs the fit extra). ablation: what the raster stage finds without
+        parts of its shading, its losses and its prior, as in figures 15, 17 and 18 of Li et al. 2024 (ten fits; needs
+        the fit extra).
     folder:
-        Of photos and losses: holds the photos. For photos also SOURCES.csv with the columns file, weave and notes
+        Of photos, fits and losses: holds the photos. For photos also SOURCES.csv with the columns file, weave and notes
         ("about N yarns across horizontally and M vertically"); for losses two or more PNG files.
     features:
         Of losses: the feature network, vgg16 or a safetensors file of another VGG.
@@ -52,15 +56,18 @@ def run(
     count:
         Of raster and ablation: fabrics of each weave; of path: how many fabrics, plain, twill and satin in turn.
     quality:
-        Of raster, ablation and path: resolution, samples and iterations, as of ``usdfab fit``.
+        Of fits, raster, ablation and path: resolution, samples and iterations, as of ``usdfab fit``.
     ablation:
         Of raster: each fabric also without parts of the shading and of the losses (six fits for each).
     fibers:
         Of raster and ablation: fibers in a yarn, instead of about 200, to save time.
     output:
-        Of ablation: a folder for its pictures (the target, then each way, side by side) and ablation.json.
+        Of ablation: a folder for its pictures (the target, then each way, side by side) and ablation.json. Of fits: a
+        folder for each photo's asset, picture (photo, then each stage) and numbers.
+    stages:
+        Of fits: as of ``usdfab fit``.
     """
-    if output is not None and what != "ablation":
+    if output is not None and what not in ("ablation", "fits"):
         raise UsdfabError(f"evaluate {what} writes no files", place="--output", remedy="leave it out")
     if what in ("raster", "ablation", "path"):
         if folder is not None:
@@ -78,8 +85,28 @@ def run(
         raise UsdfabError(f"evaluate {what} needs a folder of photos", remedy=f"usdfab evaluate {what} FOLDER")
     if what == "losses":
         _losses(folder, features, fast, json)
+    elif what == "fits":
+        _fits(folder, output, stages, quality, seed, json)
     else:
         _photos(folder, json)
+
+
+def _fits(folder: Path, output: Path | None, stages: str, quality: str, seed: int, json: bool) -> None:
+    from dataclasses import asdict
+
+    from usdfab.fit.fit_evaluation import evaluate_fits, format_fits
+
+    if output is None:
+        raise UsdfabError("evaluate fits needs a folder to write to", remedy="usdfab evaluate fits FOLDER -o RESULTS")
+    names = [name.strip() for name in stages.split(",")]
+    with progress_bar("Fits") as update:
+        rows = evaluate_fits(
+            folder, output, stages=names, quality=quality, seed=seed, progress=lambda text, k, n: update(k, n, text)
+        )
+    if json:
+        print_json({"fits": [asdict(row) for row in rows]})
+    else:
+        print(format_fits(rows))
 
 
 def _path(count: int, seed: int, quality: Literal["draft", "standard", "paper"], json: bool) -> None:

@@ -201,7 +201,7 @@ def save_pixels(oiio: Any, target: Path, spec: Any, data: NDArray[Any]) -> None:
             output = oiio.ImageOutput.create(str(temporary))
             if output is None:
                 raise UsdfabError(f"cannot be written ({oiio.geterror()})", place=place)
-            done = output.open(str(temporary), spec) and output.write_image(data)
+            done = output.open(str(temporary), spec) and output.write_image(np.ascontiguousarray(data))
             done = output.close() and done
             complaint = " ".join(output.geterror().replace(_TIFF_CHATTER, "").split())
             if not done or complaint:
