@@ -31,7 +31,7 @@ MAX_ALBEDO = 0.995
 BRIGHT_ALBEDO = 0.95
 """Albedo of the brightest yarns of a photo that shows more light than the rig's standard exposure can explain."""
 
-DARK_ALBEDO = 0.06
+DARK_ALBEDO = 0.03
 """Albedo, in its darkest channel, of yarns more saturated than cloth can look under the rig's standard exposure."""
 
 LEAST_EXPOSURE = 0.1
