@@ -5,5 +5,6 @@ shadows it; ``hits`` says where rays meet fibers and ``shade`` gives their color
 one thing covers another, which ``jumps`` and ``shadows`` find; ``renderer`` joins them.
 
 What is done for each pixel are Numba kernels in double precision inside ``torch.autograd.Function``s, with derivatives
-written out by hand: plain torch took twenty times as long, most of it to gather what kernels keep in registers.
+written out by hand: plain torch took three to five times as long, most of it to gather what kernels keep in
+registers (``tests/benchmarks/bench_raster.py``).
 """
