@@ -105,7 +105,9 @@ def load_photo(
         notes.append(f"cropped to {x1 - x0} x {y1 - y0} of {columns} x {rows} pixels")
     pixels, note = _middle(pixels)
     notes += note
-    clipped = (float((pixels.max(axis=2) >= TOP).mean()), float((pixels.max(axis=2) <= 1e-6).mean()))
+    brightest = np.maximum(np.maximum(pixels[..., 0], pixels[..., 1]), pixels[..., 2])
+    clipped = (float((brightest >= TOP).mean()), float((brightest <= 1e-6).mean()))
+    del brightest
     factor = max(1, min(pixels.shape[:2]) // WORKING_SIDE)
     if factor > 1:
         notes.append(f"averaged over {factor} x {factor} pixels, from {pixels.shape[1]} x {pixels.shape[0]}")
