@@ -18,6 +18,7 @@ from usdfab.fabric import FabricParameters, Provenance, YarnParameters, weave_fr
 from usdfab.fit import report
 from usdfab.fit.analysis import PhotoAnalysis, analyze_photo
 from usdfab.fit.comparison import difference
+from usdfab.fit.doubts import Doubt
 from usdfab.fit.pipeline import Fit
 from usdfab.fit.report_page import loss_plot
 from usdfab.fit.report_table import parameter_rows
@@ -114,6 +115,10 @@ def test_each_parameter_says_where_it_comes_from() -> None:
     assert rows["crimp"].known[0] == "raster stage" and rows["crimp"].known[1] == "prior"
     assert rows["albedo"].known[0] == "path stage, ± 0.02" and rows["albedo"].known[1].startswith("photo, confidence")
     assert rows["count"].known[0] == f"photo, confidence {fit.analysis.warp.count_confidence:.2f}"
+    doubt = Doubt("blur", "it is blurred", ("twist", "warp.crimp"))
+    marked = {row.name: row for row in parameter_rows(fit.fabric, fit.analysis, fit.stages, [doubt])}
+    assert marked["crimp"].known == ("raster stage; doubtful: blur", "prior")
+    assert all(known.endswith("; doubtful: blur") for known in marked["twist"].known)
     assert rows["cuticle_tilt"].known == ("default", "default")
     assert (rows["radius"].unit, rows["radius"].values[0]) == ("µm", "200")
 

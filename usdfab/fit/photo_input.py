@@ -26,6 +26,9 @@ TOP = 0.98
 MOST_ASPECT = 4.0
 """Of longer photos the middle is taken: a lattice needs yarns both ways."""
 
+TAGGED = "the file's resolution"
+NOT_SQUARE = 0.01
+
 NOTED = ("transparent", "turned upright", "colour profile")
 """Words of those remarks of the image reader that a person should see."""
 
@@ -91,6 +94,10 @@ def load_photo(
     width, source = _physical_width(columns, width, pixel_size, image.pixel_size)
     meters = width / columns
     notes = [note for note in image.notes if any(word in note for word in NOTED)]
+    tagged = image.pixel_size
+    if source == TAGGED and tagged is not None and abs(tagged[0] / tagged[1] - 1.0) > NOT_SQUARE:
+        size = f"{tagged[0] * 1e6:.4g} x {tagged[1] * 1e6:.4g} µm"
+        notes.append(f"the file says that pixels are {size}; their width is taken for both")
     box = None if crop is None else _checked_crop(crop(columns, rows), columns, rows)
     if box is not None:
         x0, y0, x1, y1 = box
@@ -98,7 +105,9 @@ def load_photo(
         notes.append(f"cropped to {x1 - x0} x {y1 - y0} of {columns} x {rows} pixels")
     pixels, note = _middle(pixels)
     notes += note
-    clipped = (float((pixels.max(axis=2) >= TOP).mean()), float((pixels.max(axis=2) <= 1e-6).mean()))
+    brightest = np.maximum(np.maximum(pixels[..., 0], pixels[..., 1]), pixels[..., 2])
+    clipped = (float((brightest >= TOP).mean()), float((brightest <= 1e-6).mean()))
+    del brightest
     factor = max(1, min(pixels.shape[:2]) // WORKING_SIDE)
     if factor > 1:
         notes.append(f"averaged over {factor} x {factor} pixels, from {pixels.shape[1]} x {pixels.shape[0]}")
@@ -158,7 +167,7 @@ def _physical_width(
     elif pixel_size is not None:
         value, source = pixel_size * columns, "--pixel-size"
     elif tagged is not None:
-        value, source = tagged[0] * columns, "the file's resolution"
+        value, source = tagged[0] * columns, TAGGED
     else:
         value, source = DEFAULT_WIDTH, "default"
     if not SIZE_RANGE[0] <= value <= SIZE_RANGE[1]:

@@ -77,7 +77,7 @@ def report_page(
         "<h2>The fabric</h2>",
         _facts(fit),
         "<h2>Parameters</h2>",
-        _parameters(parameter_rows(fit.fabric, fit.analysis, fit.stages)),
+        _parameters(parameter_rows(fit.fabric, fit.analysis, fit.stages, fit.doubts)),
         "<h2>Stages</h2>",
         _stages(fit.stages),
         *([_figure(pictures["drape"], CAPTIONS["drape"], "<h2>On a drape</h2>")] if "drape" in pictures else []),

@@ -10,6 +10,7 @@ from typing import Any
 from usdfab.fabric import SYSTEMS, YARN_PARAMETERS, FabricParameters, Parameter, System
 from usdfab.fabric.parameters import PARAMETER_BY_NAME
 from usdfab.fit.analysis import PhotoAnalysis, YarnSystem
+from usdfab.fit.doubts import Doubt
 from usdfab.fit.priors import MIN_CONFIDENCE
 from usdfab.fit.stages import StageOutcome
 
@@ -28,13 +29,17 @@ class Row:
     known: tuple[str, str]
 
 
-def parameter_rows(fabric: FabricParameters, analysis: PhotoAnalysis, stages: Sequence[StageOutcome]) -> list[Row]:
-    """All rows of the parameter table for a fit."""
+def parameter_rows(
+    fabric: FabricParameters, analysis: PhotoAnalysis, stages: Sequence[StageOutcome], doubts: Sequence[Doubt] = ()
+) -> list[Row]:
+    """All rows of the parameter table for a fit; ``doubts`` are named at the parameters that they concern."""
     rows = []
     for parameter in YARN_PARAMETERS:
         unit, factor = UNITS.get(parameter.unit, (parameter.unit, 1.0))
         warp, weft = (_value(getattr(fabric.system(s), parameter.name), factor) for s in SYSTEMS)
-        known_warp, known_weft = (_known(parameter, s, analysis, stages, factor) for s in SYSTEMS)
+        known_warp, known_weft = (
+            _known(parameter, s, analysis, stages, factor) + _doubted(parameter.name, s, doubts) for s in SYSTEMS
+        )
         shown = "" if unit == "1" else unit
         rows.append(Row(parameter.name, parameter.symbol, shown, (warp, weft), (known_warp, known_weft)))
     return rows
@@ -64,6 +69,11 @@ def _known(
     if sure < MIN_CONFIDENCE and parameter.name in ("twist", "radius"):
         return f"prior (photo: confidence {sure:.2f})"
     return f"photo, confidence {sure:.2f}"
+
+
+def _doubted(name: str, system: System, doubts: Sequence[Doubt]) -> str:
+    causes = dict.fromkeys(d.cause for d in doubts if name in d.parameters or f"{system}.{name}" in d.parameters)
+    return f"; doubtful: {', '.join(causes)}" if causes else ""
 
 
 def _confidence(name: str, seen: YarnSystem) -> float | None:

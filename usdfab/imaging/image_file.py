@@ -77,7 +77,9 @@ def read_image(path: str | Path) -> Image:
 
     linear_file = np.issubdtype(_numpy_type(spec.format), np.floating)
     linear_file = linear_file or str(tags.get("oiio:ColorSpace", "")).lower().startswith("lin")
-    pixels = _decoded(data[..., color], linear_file)
+    # A slice is a view; a list of channels copies the whole picture, plane by plane.
+    neighbours = color == list(range(color[0], color[-1] + 1))
+    pixels = _decoded(data[..., color[0] : color[-1] + 1] if neighbours else data[..., color], linear_file)
     if not np.isfinite(pixels).all():
         raise UsdfabError("the picture has NaN or infinite pixels", place=place, remedy="repair or crop it")
     profile = tags.get("ICCProfile:profile_description")
