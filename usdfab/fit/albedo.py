@@ -90,8 +90,8 @@ def photo_exposure(shown: FabricParameters, curves: dict[System, BrightnessCurve
     a white diffuse surface is 1, and cloth of white fibers is darker than that; a camera, however, exposes white cloth
     as white. So where the photo's colours ask for more than fibers of albedo ``BRIGHT_ALBEDO`` give, the light was
     stronger. And even black fibers reflect some light off their surface, which has no colour: where a channel is darker
-    than fibers of ``DARK_ALBEDO`` are, as in deep red cloth, the light was weaker; that counts half, in stops, since the gloss of the fibers is
-    not known either. Between the two it is 1; of the two, the first counts.
+    than fibers of ``DARK_ALBEDO`` are, as in deep red cloth, the light was weaker; that counts half, in stops, since
+    the gloss of the fibers is not known either. Between the two it is 1; of the two, the first counts.
 
     Parameters
     ----------
