@@ -119,6 +119,8 @@ def test_each_parameter_says_where_it_comes_from() -> None:
     marked = {row.name: row for row in parameter_rows(fit.fabric, fit.analysis, fit.stages, [doubt])}
     assert marked["crimp"].known == ("raster stage; doubtful: blur", "prior")
     assert all(known.endswith("; doubtful: blur") for known in marked["twist"].known)
+    assert rows["fiber_radius"].known == ("from fiber_count and packing",) * 2
+    assert float(rows["fiber_radius"].values[0]) == pytest.approx(1e6 * YARN.effective_fiber_radius, rel=1e-3)
     assert rows["cuticle_tilt"].known == ("default", "default")
     assert (rows["radius"].unit, rows["radius"].values[0]) == ("µm", "200")
 

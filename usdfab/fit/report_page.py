@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
-from usdfab.fabric import FabricParameters, Weave
+from usdfab.fabric import SYSTEMS, FabricParameters, Weave, hex_color
 from usdfab.fit.pipeline import Fit
 from usdfab.fit.report_table import Row, parameter_rows
 from usdfab.fit.stages import StageOutcome
@@ -28,7 +28,7 @@ figcaption { font-size: .88rem; color: #555; margin-top: .3rem; }
 table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; width: 100%; }
 th, td { text-align: left; padding: .25rem .8rem .25rem 0; border-bottom: 1px solid #eee; vertical-align: top; }
 th { color: #555; font-weight: 600; }
-td.n { text-align: right; white-space: nowrap; }
+th.n, td.n { text-align: right; white-space: nowrap; }
 td.k { color: #666; font-size: .84rem; }
 ul.warnings { background: #fff7e6; border-left: 4px solid #e0a100; padding: .7rem 1rem .7rem 2rem; }
 code { font-size: .92em; background: #f4f4f4; padding: .05rem .3rem; overflow-wrap: anywhere; }
@@ -152,8 +152,6 @@ def _facts(fit: Fit) -> str:
 
 def _colors(fabric: FabricParameters) -> str:
     """What each system's fibers are dyed with."""
-    from usdfab.fabric import SYSTEMS, hex_color
-
     lines = []
     for system in SYSTEMS:
         yarns = "".join(
@@ -171,7 +169,8 @@ def _weave(weave: Weave) -> str:
 
 
 def _parameters(rows: Sequence[Row]) -> str:
-    head = "<tr><th>parameter</th><th>symbol</th><th>unit</th><th>warp</th><th></th><th>weft</th><th></th></tr>"
+    systems = "".join(f"<th class=n>{system}</th><th></th>" for system in SYSTEMS)
+    head = f"<tr><th>parameter</th><th>symbol</th><th>unit</th>{systems}</tr>"
     body = "".join(
         f"<tr><td>{escape(r.name)}</td><td>{escape(r.symbol)}</td><td>{escape(r.unit)}</td>"
         + "".join(
@@ -188,7 +187,8 @@ def _parameters(rows: Sequence[Row]) -> str:
 
 
 def _stages(stages: Sequence[StageOutcome]) -> str:
-    head = "<tr><th>stage</th><th>seconds</th><th>iterations</th><th>distance</th><th>remarks</th></tr>"
+    numbers = "".join(f"<th class=n>{name}</th>" for name in ("seconds", "iterations", "distance"))
+    head = f"<tr><th>stage</th>{numbers}<th>remarks</th></tr>"
     body = "".join(
         f"<tr><td>{escape(s.name)}</td><td class=n>{s.seconds:.0f}</td><td class=n>{len(s.losses) or '–'}</td>"
         f"<td class=n>{'–' if s.distance is None else f'{s.distance:.3f}'}</td>"

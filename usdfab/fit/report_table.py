@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from usdfab.fabric import SYSTEMS, YARN_PARAMETERS, FabricParameters, Parameter, System
+from usdfab.fabric import SYSTEMS, YARN_PARAMETERS, FabricParameters, Parameter, System, YarnParameters
 from usdfab.fabric.parameters import PARAMETER_BY_NAME
 from usdfab.fit.analysis import PhotoAnalysis, YarnSystem
 from usdfab.fit.doubts import Doubt
@@ -36,13 +36,17 @@ def parameter_rows(
     rows = []
     for parameter in YARN_PARAMETERS:
         unit, factor = UNITS.get(parameter.unit, (parameter.unit, 1.0))
-        warp, weft = (_value(getattr(fabric.system(s), parameter.name), factor) for s in SYSTEMS)
+        warp, weft = (_value(_shown(fabric.system(s), parameter.name), factor) for s in SYSTEMS)
         known_warp, known_weft = (
             _known(parameter, s, analysis, stages, factor) + _doubted(parameter.name, s, doubts) for s in SYSTEMS
         )
         shown = "" if unit == "1" else unit
         rows.append(Row(parameter.name, parameter.symbol, shown, (warp, weft), (known_warp, known_weft)))
     return rows
+
+
+def _shown(yarn: YarnParameters, name: str) -> Any:
+    return yarn.effective_fiber_radius if name == "fiber_radius" else getattr(yarn, name)
 
 
 def _value(value: Any, factor: float) -> str:
@@ -63,6 +67,11 @@ def _known(
             continue
         spread = [v for k, v in stage.uncertainty.items() if k.split("[")[0] == f"{system}.{parameter.name}"]
         return f"{stage.name} stage" + (f", ± {max(spread) * factor:.2g}" if spread else "")
+    yarn = stages[-1].fabric.system(system)
+    if parameter.name == "fiber_radius" and not yarn.fiber_radius:
+        return "from fiber_count and packing"
+    if parameter.name == "yarn_albedo":
+        return "photo" if yarn.yarn_albedo else "one colour"
     sure = _confidence(parameter.name, getattr(analysis, system))
     if sure is None:
         return "prior" if PARAMETER_BY_NAME[parameter.name].stages else "default"

@@ -32,7 +32,7 @@ FOLDS = 7
 FLOOR = -0.39
 """Height of the floor below the ball's centre, over the cloth's side: just under the corners."""
 
-EYE, TARGET, HALF_VIEW = (0.35, -2.2, 1.15), (0.0, 0.0, -0.11), 0.14
+EYE, TARGET, HALF_VIEW = (0.35, -2.2, 1.15), (0.0, 0.0, -0.125), 0.15
 KEY = (1.8, -1.2, 2.2)
 """Where camera and lamp are and where they look, over the cloth's side."""
 
