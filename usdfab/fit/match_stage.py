@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
-from usdfab.fabric import FabricParameters
+from usdfab.fabric import SYSTEMS, FabricParameters
 from usdfab.files import whole_file
 from usdfab.fit.match_space import EXPOSURE, MOVES, MatchSpace
 from usdfab.fit.match_steps import broyden_update, damped_step, normal_equations, soft_l1
@@ -41,6 +41,14 @@ FORMAT = "usdfab-match/1"
 LONGEST_STEP = 2.0
 DAMPINGS = (0.01, 0.1, 1.0)
 """Tried one after another until a step leads down; each iteration begins with the one that last did."""
+
+WIDTHS = (1.0, 0.85, 0.72)
+"""Of the yarns, times the start's, that are tried before the first round: how dark the valleys between yarns are
+decides more than all else, and from touching yarns the way to separate ones leads uphill."""
+
+PLIES = (1, 2)
+LIGHTS = (0.75, 1.0, 1.33, 1.75)
+"""Exposures, times the start's, with which each of these is seen."""
 
 VARIED_CELLS = 64
 """Crossings of all variants of the repeat together beyond which pictures show fewer variants."""
@@ -88,7 +96,14 @@ class MatchSettings:
         """How many pictures are rendered at most, about."""
         systems, channels = 2, 3
         coordinates = systems * (len(self.free) + (channels - 1 if "albedo" in self.free else 0))
-        return 1 + self.iterations * (coordinates + self.steps * len(DAMPINGS))
+        return len(self.starts) + self.iterations * (coordinates + self.steps * len(DAMPINGS))
+
+    @property
+    def starts(self) -> tuple[tuple[float, int], ...]:
+        """Widths of yarns and numbers of plies that are tried first; one pair where shapes are not free."""
+        if "radius" in self.free and "flattening" in self.free:
+            return tuple((width, plies) for plies in PLIES for width in WIDTHS)
+        return ((1.0, 1),)
 
 
 QUALITIES: dict[str, MatchSettings] = {
@@ -130,6 +145,8 @@ class _State:
     round: int
     point: Floats
     losses: list[float]
+    start: int = 0
+    light: float = 1.0
     damping: int = 0
     deviations: Floats | None = None
 
@@ -219,17 +236,18 @@ def match_photo(
 
     from usdfab.fit.texture import Target
 
-    space = MatchSpace.about(start, settings.free, exposure)
     picture = torch.from_numpy(np.ascontiguousarray(goal, dtype=np.float32)).permute(2, 0, 1)
     seen = _Seen(Target.from_image(picture, net, settings.levels, settings.kind), settings)
     identity = fingerprint(start, np.asarray(goal, dtype=np.float32), settings, float(exposure))
-    state = _State(0, np.zeros(len(space.names)), [])
+    state = None
     if checkpoint is not None and checkpoint.exists():
         state = _load(checkpoint, identity)
-    search = _Search(space, seen, settings, state, progress)
+    search = _Search(start, exposure, seen, settings, state, progress)
+    space, state = search.space, search.state
     interrupted = False
     try:
         search.begin()
+        space = search.space
         while state.round < settings.iterations:
             search.round()
             if checkpoint is not None:
@@ -243,26 +261,67 @@ def match_photo(
     )  # fmt: skip
 
 
+def first_look(start: FabricParameters, width: float, plies: int) -> FabricParameters:
+    """``start`` with yarns narrower by the factor ``width``, first rounder, then thinner, and so many plies.
+
+    The plies are twisted as the fibers were, for what a photo shows of twist is the slant of the lines on the yarn, and
+    the fibers in them the other way. A yarn that has plies keeps them.
+    """
+    fabric = start
+    for system in SYSTEMS:
+        yarn = start.system(system)
+        flattening = max(min(yarn.flattening, 1.0), yarn.flattening * width)
+        radius = yarn.radius * width * yarn.flattening / flattening
+        yarn = replace(yarn, flattening=flattening, radius=radius)
+        if plies > 1 and yarn.ply_count == 1:
+            yarn = replace(yarn, ply_count=plies, ply_twist=-yarn.twist)
+        fabric = replace(fabric, **{system: yarn})  # type: ignore[arg-type]
+    return fabric
+
+
 class _Search:
     def __init__(
         self,
-        space: MatchSpace,
+        start: FabricParameters,
+        exposure: float,
         seen: _Seen,
         settings: MatchSettings,
-        state: _State,
+        state: _State | None,
         progress: Callable[[int, int, float], None] | None,
     ) -> None:
-        self.space, self.seen, self.settings, self.state = space, seen, settings, state
+        self.seen, self.settings, self.fresh = seen, settings, state is None
+        self.space = MatchSpace.about(start, settings.free, exposure)
+        self.state = state or _State(0, np.zeros(len(self.space.names)), [])
         self._progress = progress or (lambda *_: None)
-        self._each = len(space.names) + settings.steps * len(DAMPINGS)
-        self._done = state.round * self._each
+        self._starts = [first_look(start, *look) for look in settings.starts]
+        self._each = len(self.space.names) + settings.steps * len(DAMPINGS)
+        self._done = self.state.round * self._each
         self.loss = math.inf
 
     def begin(self) -> None:
-        """Look at the point where the search stands."""
-        self.picture, self.residuals, self.loss = self._look(self.state.point)
-        if not self.state.losses:
-            self.state.losses.append(self.loss)
+        """Choose a start, or look at the point where the search stood."""
+        state, exposure = self.state, self.space.light
+        if not self.fresh:
+            self.space = replace(self.space, start=self._starts[state.start], light=exposure * state.light)
+            self._done += len(self._starts) - 1
+            self.picture, self.residuals, self.loss = self._look(state.point)
+            return
+        for k, start in enumerate(self._starts):
+            picture = self.seen.picture(start)
+            self._done += 1
+            # Where there is no choice of starts, the start's exposure is taken as it is.
+            for light in LIGHTS if len(self._starts) > 1 else (1.0,):
+                residuals = self.seen.residuals(picture, exposure * light)
+                loss = soft_l1(residuals, self.seen.weights)
+                if k == 0 and light == 1.0:
+                    state.losses.append(loss)
+                if loss < self.loss:
+                    self.picture, self.residuals, self.loss = picture, residuals, loss
+                    state.start, state.light = k, light
+            self._tell(self.loss)
+        if (state.start, state.light) != (0, 1.0):
+            state.losses.append(self.loss)
+        self.space = replace(self.space, start=self._starts[state.start], light=exposure * state.light)
 
     def round(self) -> None:
         """One round of finite differences, and the steps that follow from it."""
@@ -314,8 +373,11 @@ class _Search:
         prior = 0.5 * self.settings.prior * float(np.sum((point / self.space.spread) ** 2))
         loss = soft_l1(residuals, self.seen.weights) + prior
         self._done += 1
-        self._progress(self._done, self._each * self.settings.iterations, min(loss, self.loss))
+        self._tell(min(loss, self.loss))
         return picture, residuals, loss
+
+    def _tell(self, loss: float) -> None:
+        self._progress(self._done, self.settings.pictures, loss)
 
     def _deviations(self, matrix: Floats) -> Floats:
         hessian = matrix + np.diag(self.settings.prior / self.space.spread**2)
@@ -324,10 +386,11 @@ class _Search:
 
 
 def _save(path: Path, identity: str, state: _State) -> None:
-    about = json.dumps({"format": FORMAT, "identity": identity, "round": state.round, "damping": state.damping})
+    about = json.dumps({"format": FORMAT, "identity": identity, "round": state.round})
+    numbers = {"start": state.start, "light": state.light, "damping": state.damping, "point": state.point}
     try:
         with whole_file(path) as temporary, temporary.open("wb") as stream:
-            np.savez(stream, about=about, point=state.point, losses=state.losses, deviations=state.deviations)  # type: ignore[arg-type]
+            np.savez(stream, about=about, losses=state.losses, deviations=state.deviations, **numbers)  # type: ignore[arg-type]
     except OSError as error:
         raise UsdfabError(
             f"cannot be written ({error.strerror or error})", place=str(path), remedy="make room or use another disk"
@@ -341,8 +404,9 @@ def _load(path: Path, identity: str) -> _State:
             if about["format"] != FORMAT:
                 raise ValueError
             state = _State(
-                int(about["round"]), data["point"], data["losses"].tolist(), int(about["damping"]), data["deviations"]
-            )
+                int(about["round"]), data["point"], data["losses"].tolist(), int(data["start"]), float(data["light"]),
+                int(data["damping"]), data["deviations"],
+            )  # fmt: skip
             same = about["identity"] == identity
     except OSError as error:
         raise UsdfabError(f"cannot be read ({error.strerror or error})", place=str(path)) from error
