@@ -163,6 +163,15 @@ def test_a_stage_that_breaks_leaves_those_before_it(
     assert pretended["raster"] == before["raster"] + (stage == "raster")
 
 
+def test_a_stage_added_before_an_unfinished_one(pretended: dict[str, int], photo: Path, tmp_path: Path) -> None:
+    """What is left of the path stage belongs to another start then: it is not looked at."""
+    files = CheckpointFiles(tmp_path / "out.usda")
+    fitted(photo, checkpoint=files, stages=("analysis",))
+    files.of("path").write_bytes(b"left over")
+    assert fitted(photo, checkpoint=files, resume=True).fabric == fitted(photo).fabric
+    assert pretended["raster"] == 2 and not files.of("path").exists()
+
+
 @pytest.mark.parametrize("stage", ["raster", "path"])
 def test_ctrl_c_keeps_the_best_so_far(
     stage: str, pretended: dict[str, int], photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -97,7 +97,7 @@ def test_grey_and_transparent_photos(tmp_path: Path) -> None:
     hole = np.dstack([codes(8), np.full(cloth().shape[:2], 255, np.uint8)])
     hole[:40, :50, 3] = 0
     photo = load_photo(save(tmp_path / "hole.png", hole, "uint8"), 3e-3)
-    assert any("transparent" in note for note in photo.notes)
+    assert any("transparent" in note for note in photo.warnings)
     assert (photo.pixels[:40, :50] == 0).all() and (photo.pixels[60:] > 0).any()
 
 
@@ -130,7 +130,7 @@ def test_the_files_resolution_counts_and_pixels_are_square(tags: tuple[float, fl
     )  # fmt: skip
     photo = load_photo(path)
     assert photo.width == pytest.approx(240e-5, rel=1e-3) and photo.size_source == "the file's resolution"
-    assert any("their width is taken for both" in note for note in photo.notes) == (tags[0] != tags[1])
+    assert any("their width is taken for both" in note for note in photo.warnings) == (tags[0] != tags[1])
 
 
 def test_a_large_photo_is_averaged_and_measures_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,7 +150,7 @@ def test_of_a_long_photo_the_middle_is_used(tmp_path: Path) -> None:
     for name, pixels in (("wide", wide), ("tall", np.swapaxes(wide, 0, 1))):
         photo = load_photo(write_image(tmp_path / f"{name}.png", pixels), 4.8e-3)
         assert sorted(photo.pixels.shape[:2]) == [30, 120]
-        assert any("only the middle of the long photo" in note for note in photo.notes)
+        assert any("only the middle of the long photo" in note for note in photo.warnings)
         assert photo.width == pytest.approx(4.8e-3 * photo.pixels.shape[1] / pixels.shape[1])
 
 

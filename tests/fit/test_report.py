@@ -104,8 +104,13 @@ def test_the_page_needs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyP
     for said in (NASTY, "careful <now>", "<i>remark</i>", "a note with <b>", "x & y.usda", "± 0.02", "0.900"):
         assert said in page.text
     assert page.tags.count("svg") == 2
-    with pytest.raises(UsdfabError, match="--overwrite"):
-        report.write_report(made(), folder, spp=1)
+    for refused in (report.write_report, lambda _fit, there: report.check_report_folder(there)):
+        with pytest.raises(UsdfabError, match="--overwrite"):
+            refused(made(), folder)
+    with pytest.raises(UsdfabError, match="a file is in the folder's place"):
+        report.check_report_folder(paths["photo"])
+    report.check_report_folder(folder, overwrite=True)
+    report.check_report_folder(tmp_path / "new")
     assert read_image(paths["drape"]).pixels.shape == (30, 40, 3)
 
 

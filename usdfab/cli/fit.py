@@ -88,12 +88,14 @@ def run(
     from usdfab.files import checked_output
     from usdfab.fit.fit_checkpoint import CheckpointFiles
     from usdfab.fit.pipeline import fit_photo
-    from usdfab.fit.report import PAGE, write_report
+    from usdfab.fit.report import PAGE, check_report_folder, write_report
     from usdfab.imaging import check_denoiser
     from usdfab.usd.atomic import USD_SUFFIXES
     from usdfab.usd.fabric_io import write_fabric
 
     checked_output(output, USD_SUFFIXES, overwrite=overwrite)
+    if report is not None:
+        check_report_folder(report, overwrite=overwrite)
     if denoise:
         check_denoiser()
     if not 0 <= seed < 2**31:

@@ -25,6 +25,7 @@ from usdfab.fit.dataset.records import fabric_from_table
 from usdfab.fit.stages import StageOutcome
 
 FORMAT = "usdfab-fit/1"
+STATE_SUFFIXES = {"raster": "safetensors", "match": "npz", "path": "npz"}
 
 
 @dataclass(frozen=True)
@@ -38,28 +39,17 @@ class CheckpointFiles:
         """Finished stages."""
         return self.output.with_name(f"{self.output.name}.fit.json")
 
-    @property
-    def raster(self) -> Path:
-        """The state of the raster stage."""
-        return self.output.with_name(f"{self.output.name}.raster.safetensors")
-
-    @property
-    def match(self) -> Path:
-        """The state of the match stage."""
-        return self.output.with_name(f"{self.output.name}.match.npz")
-
-    @property
-    def path(self) -> Path:
-        """The state of the path stage."""
-        return self.output.with_name(f"{self.output.name}.path.npz")
+    def of(self, stage: str) -> Path:
+        """The state of a stage after the analysis."""
+        return self.output.with_name(f"{self.output.name}.{stage}.{STATE_SUFFIXES[stage]}")
 
     def existing(self) -> list[Path]:
         """Those that are there."""
-        return [file for file in (self.fit, self.raster, self.match, self.path) if file.exists()]
+        return [file for file in (self.fit, *map(self.of, STATE_SUFFIXES)) if file.exists()]
 
     def remove(self) -> None:
         """Nothing is left to resume."""
-        for file in (self.fit, self.raster, self.match, self.path):
+        for file in self.existing():
             file.unlink(missing_ok=True)
 
 

@@ -105,12 +105,16 @@ class LaterStages:
         photo, rotation:
             (H, W, 3) linear; turn of the cloth in it, radians.
         """
-        outcomes = [first]
+        outcomes, ran = [first], False
         for name in self.names:
             last = outcomes[-1]
             job = self._job(name, last)
             done = kept.finished(len(outcomes), name, job)
             if done is None:
+                if ran and self.files is not None:
+                    # Only the first stage that is not finished can have been left unfinished from the same start.
+                    self.files.of(name).unlink(missing_ok=True)
+                ran = True
                 try:
                     before, done = self._run(name, last, shown, photo, rotation, course)
                 except KeyboardInterrupt:
@@ -140,7 +144,7 @@ class LaterStages:
         if name == "raster":
             before, after = run_raster(
                 last.fabric, shown, photo, rotation, self.raster, seed=self.seed, exposure=last.exposure,
-                albedo_paths=self.albedo_paths, checkpoint=self.files.raster if self.files else None, resume=True,
+                albedo_paths=self.albedo_paths, checkpoint=self.files.of(name) if self.files else None, resume=True,
                 progress=course.stage(name),
             )  # fmt: skip
             return before.distance, after
@@ -150,14 +154,13 @@ class LaterStages:
             assert self.match is not None
             return run_match(
                 last.fabric, photo, rotation, self.match, self.raster, exposure=last.exposure, distance=last.distance,
-                checkpoint=self.files.match if self.files else None, progress=course.stage(name),
+                checkpoint=self.files.of(name) if self.files else None, progress=course.stage(name),
             )  # fmt: skip
         from usdfab.fit.path_run import run_path
 
         return run_path(
             last.fabric, photo, rotation, self.path, self.raster, halfway=last.halfway, exposure=last.exposure,
-            distance=last.distance,
-            checkpoint=self.files.path if self.files else None, progress=course.stage(name),
+            distance=last.distance, checkpoint=self.files.of(name) if self.files else None, progress=course.stage(name),
         )  # fmt: skip
 
 

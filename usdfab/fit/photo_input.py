@@ -29,8 +29,8 @@ MOST_ASPECT = 4.0
 TAGGED = "the file's resolution"
 NOT_SQUARE = 0.01
 
-NOTED = ("transparent", "turned upright", "colour profile")
-"""Words of those remarks of the image reader that a person should see."""
+ALARMING, NOTED = ("transparent", "colour profile"), ("turned upright",)
+"""Words of those remarks of the image reader that are warnings, and of those that a person may want to know."""
 
 Crop = Callable[[int, int], tuple[int, int, int, int]]
 """From width and height of the picture in pixels to (x0, y0, x1, y1), from the top left, upper ends excluded."""
@@ -55,8 +55,8 @@ class Photo:
         Of the file.
     box: (x0, y0, x1, y1) or None
         The crop in pixels of the file.
-    notes:
-        Sentences for people.
+    notes, warnings:
+        Sentences for people: what was done, and what may be wrong.
     """
 
     pixels: NDArray[np.float32]
@@ -66,6 +66,7 @@ class Photo:
     sha256: str
     box: tuple[int, int, int, int] | None = None
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def load_photo(
@@ -94,17 +95,18 @@ def load_photo(
     width, source = _physical_width(columns, width, pixel_size, image.pixel_size)
     meters = width / columns
     notes = [note for note in image.notes if any(word in note for word in NOTED)]
+    warnings = [note for note in image.notes if any(word in note for word in ALARMING)]
     tagged = image.pixel_size
     if source == TAGGED and tagged is not None and abs(tagged[0] / tagged[1] - 1.0) > NOT_SQUARE:
         size = f"{tagged[0] * 1e6:.4g} x {tagged[1] * 1e6:.4g} µm"
-        notes.append(f"the file says that pixels are {size}; their width is taken for both")
+        warnings.append(f"the file says that pixels are {size}; their width is taken for both")
     box = None if crop is None else _checked_crop(crop(columns, rows), columns, rows)
     if box is not None:
         x0, y0, x1, y1 = box
         pixels = pixels[y0:y1, x0:x1]
         notes.append(f"cropped to {x1 - x0} x {y1 - y0} of {columns} x {rows} pixels")
-    pixels, note = _middle(pixels)
-    notes += note
+    pixels, warning = _middle(pixels)
+    warnings += warning
     brightest = np.maximum(np.maximum(pixels[..., 0], pixels[..., 1]), pixels[..., 2])
     clipped = (float((brightest >= TOP).mean()), float((brightest <= 1e-6).mean()))
     del brightest
@@ -120,6 +122,7 @@ def load_photo(
         hashlib.sha256(Path(path).read_bytes()).hexdigest(),
         box,
         tuple(notes),
+        tuple(warnings),
     )
 
 

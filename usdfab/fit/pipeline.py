@@ -122,7 +122,7 @@ def fit_photo(
     assert kept.photo is not None
     analysis, shown, prior_notes = kept.photo
     doubts = find_doubts(photo, analysis)
-    warnings = [*analysis.warnings, *(doubt.warning for doubt in doubts)]
+    warnings = [*photo.warnings, *analysis.warnings, *(doubt.warning for doubt in doubts)]
     if photo.size_source == "default":
         warnings.insert(
             0, f"nothing says how large the photo is: its width is taken as {DEFAULT_WIDTH * 1e3:g} mm; use --size"
@@ -140,7 +140,6 @@ def fit_photo(
         notes=tuple(notes),
     )
     fabric = replace(outcomes[-1].fabric, provenance=provenance)
-    warnings = [*photo.notes, *warnings]
     return Fit(fabric, analysis, photo.pixels, photo.size_source, tuple(warnings), outcomes, doubts, exposure)
 
 

@@ -29,6 +29,22 @@ PAGE = "report"
 """The page's name among the report's files."""
 
 
+def check_report_folder(folder: str | Path, *, overwrite: bool = False) -> None:
+    """Refuse, before any work, a folder that a report may not be written into.
+
+    Raises
+    ------
+    UsdfabError
+        For a file in its place, and for a report in it unless ``overwrite``.
+    """
+    target = Path(folder)
+    if target.exists() and not target.is_dir():
+        raise UsdfabError("a file is in the folder's place", place=str(target), remedy="choose another folder")
+    there = [file for file in (target / f"{PAGE}.html", target / "photo.png") if file.exists()]
+    if there and not overwrite:
+        raise UsdfabError("the file exists", place=str(there[0]), remedy="choose another folder or use --overwrite")
+
+
 def write_report(
     fit: Fit,
     folder: str | Path,
@@ -72,8 +88,7 @@ def write_report(
     shown = {f"after_{stage.name}": stage.fabric for stage in earlier} | {"swatch": fit.fabric}
     names = ["photo", *shown, "comparison", "difference", "drape", *(f"{stage.name}_loss" for stage in curves)]
     paths = {name: target / f"{name}.png" for name in names} | {PAGE: target / f"{PAGE}.html"}
-    if target.exists() and not target.is_dir():
-        raise UsdfabError("a file is in the folder's place", place=str(target), remedy="choose another folder")
+    check_report_folder(target, overwrite=overwrite)
     existing = [p for p in paths.values() if p.exists()]
     if existing and not overwrite:
         raise UsdfabError("the file exists", place=str(existing[0]), remedy="choose another folder or use --overwrite")
