@@ -10,8 +10,9 @@ from usdfab.errors import UsdfabError
 
 
 def run(
-    what: Literal["photos", "losses", "raster", "path"],
+    what: Literal["photos", "losses", "raster", "path", "network"],
     folder: Path | None = None,
+    dataset: Path | None = None,
     /,
     *,
     features: str = "vgg16",
@@ -21,6 +22,8 @@ def run(
     quality: Literal["draft", "standard", "paper"] = "draft",
     ablation: bool = False,
     fibers: int | None = None,
+    photos: Path | None = None,
+    analysis: bool = True,
     json: Json = False,
 ) -> None:
     """Judge usdfab's estimates on labelled photos or random fabrics, or the losses of the fit, and print a table.
@@ -31,16 +34,19 @@ def run(
         usdfab evaluate losses FOLDER
         usdfab evaluate raster --count 1 --fibers 40
         usdfab evaluate path --count 3 --seed 1
+        usdfab evaluate network weights.safetensors fabrics --photos FOLDER
 
     Parameters
     ----------
     what:
         photos: the analysis stage on real cloth. losses: which texture statistics tell fabrics apart (needs the fit
         extra). raster, path: how well that stage recovers random fabrics of each weave from 20 % off (slow: a
-        fit for each; needs the fit extra).
+        fit for each; needs the fit extra). network: the network's guess, alone and with the analysis, on pictures
+        that it has not learned from (needs the fit extra).
     folder:
-        Of photos and losses: holds the photos. For photos also SOURCES.csv with the columns file, weave and notes
-        ("about N yarns across horizontally and M vertically"); for losses two or more PNG files.
+        Of network: its weights, or "shipped". Of photos and losses: holds the photos. For photos also SOURCES.csv with
+        the columns file, weave and notes ("about N yarns across horizontally and M vertically"); for losses two or more
+        PNG files.
     features:
         Of losses: the feature network, vgg16 or a safetensors file of another VGG.
     fast:
@@ -53,7 +59,18 @@ def run(
         Of raster: each fabric also without parts of the shading and of the losses (six fits for each).
     fibers:
         Of raster: fibers in a yarn, instead of about 200, to save time.
+    dataset:
+        Of network: a folder of ``usdfab dataset fabrics``, whose test part is judged. May be left out with --photos.
+    photos:
+        Of network: also judge a folder of labelled photos.
+    analysis:
+        Of network: also analyse each picture of the data set (slow).
     """
+    if what == "network":
+        _network(folder, dataset, photos, analysis, json)
+        return
+    if dataset is not None or photos is not None:
+        raise UsdfabError(f"evaluate {what} takes no data set", place=str(dataset or photos), remedy="leave it out")
     if what in ("raster", "path"):
         if folder is not None:
             raise UsdfabError(
@@ -70,6 +87,39 @@ def run(
         _losses(folder, features, fast, json)
     else:
         _photos(folder, json)
+
+
+def _network(weights: Path | None, dataset: Path | None, photos: Path | None, analysis: bool, json: bool) -> None:
+    from usdfab.fit.extra import require_fit_extra
+
+    require_fit_extra("evaluate network")
+    if weights is None or (dataset is None and photos is None):
+        raise UsdfabError(
+            "evaluate network needs weights, and a data set or --photos",
+            remedy="usdfab evaluate network WEIGHTS DATASET --photos FOLDER",
+        )
+    from usdfab.fit.network.evaluation import evaluate_network
+    from usdfab.fit.network.network_file import load_network
+    from usdfab.fit.network.photo_evaluation import evaluate_network_photos, format_photos, photo_json
+    from usdfab.fit.network.tables import format_report, summary
+
+    network = load_network(None if str(weights) == "shipped" else weights)
+    said: dict = {}
+    texts = []
+    if dataset is not None:
+        with progress_bar("Network") as update:
+            report = evaluate_network(network, dataset, analysis=analysis, progress=update)
+        said["report"] = summary(report)
+        texts.append(format_report(report))
+    if photos is not None:
+        with progress_bar("Photos") as update:
+            judged = evaluate_network_photos(network, photos, progress=update)
+        said["photos"] = photo_json(judged)
+        texts.append(format_photos(judged))
+    if json:
+        print_json(said)
+    else:
+        print("\n\n".join(texts))
 
 
 def _path(count: int, seed: int, quality: Literal["draft", "standard", "paper"], json: bool) -> None:

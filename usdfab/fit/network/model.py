@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -32,6 +33,10 @@ MIN_LOG_VARIANCE, MAX_LOG_VARIANCE = -6.0, 1.0
 
 class Reduced(nn.Module):
     """Standardised principal components of a vector; fitted once, not trained."""
+
+    mean: Tensor
+    scale: Tensor
+    directions: Tensor
 
     def __init__(self, size: int, components: int) -> None:
         super().__init__()
@@ -74,7 +79,7 @@ class Ensemble(nn.Module):
         sizes = (inside, hidden, hidden, outside)
         self.weights = nn.ParameterList(
             nn.Parameter(torch.randn(members, a, b) * math.sqrt((2.0 if b != outside else 0.1) / a))
-            for a, b in zip(sizes[:-1], sizes[1:], strict=True)
+            for a, b in pairwise(sizes)
         )
         self.biases = nn.ParameterList(nn.Parameter(torch.zeros(members, 1, b)) for b in sizes[1:])
         self.dropout = dropout
@@ -117,6 +122,12 @@ class Robust(nn.Module):
     """See the module. ``components`` of the texture's layers, see ``inputs.split``; ``texture`` its numbers."""
 
     parts = ("counts", "weave", "numbers")
+    target_mean: Tensor
+    target_scale: Tensor
+    shrinkage: Tensor
+    widening: Tensor
+    weave_temperature: Tensor
+    count_temperature: Tensor
 
     def __init__(self, components: Sequence[int], texture: int) -> None:
         super().__init__()
@@ -195,6 +206,8 @@ class Paper(nn.Module):
     """
 
     parts = ("paper",)
+    mean: Tensor
+    scale: Tensor
 
     def __init__(self, components: Sequence[int], weaves: int, numbers: int) -> None:
         super().__init__()

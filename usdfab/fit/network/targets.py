@@ -110,7 +110,7 @@ def encode(fabric: FabricParameters) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def decode(values: Floats) -> dict[str, Floats]:
-    """Numbers (..., P) in their units by name, each (...), and ``radius`` (over the side) and ``flattening`` with them."""
+    """Numbers (..., P) in their units by name, each (...); also ``radius``, over the side, and ``flattening``."""
     found = {target.name: target.decode(values[..., k]) for k, target in enumerate(TARGETS)}
     found["radius"] = found["height"] / (2.0 * found["count"])
     found["flattening"] = np.maximum(found["cover"] / found["height"], 1.0)

@@ -46,7 +46,7 @@ class TrainSettings:
     model:
         One of ``MODELS``.
     rate, decay, batch:
-        Of Adam with decoupled weight decay; ``None``: the model's own (the paper's: 1e-4, none, 8).
+        Of Adam with decoupled weight decay; by default the model's own (the paper's: 1e-4, none, 8).
     share:
         Part of the training samples that is used; for learning curves.
     """
@@ -54,9 +54,9 @@ class TrainSettings:
     model: str = "robust"
     epochs: int = 60
     seed: int = 0
-    rate: float | None = None
-    decay: float | None = None
-    batch: int | None = None
+    rate: float = 0.0
+    decay: float = -1.0
+    batch: int = 0
     share: float = 1.0
 
     def __post_init__(self) -> None:
@@ -74,9 +74,9 @@ class TrainSettings:
         rate, decay, batch = (1e-4, 0.0, 8) if self.model == "paper" else (2e-3, 0.05, 64)
         return replace(
             self,
-            rate=rate if self.rate is None else self.rate,
-            decay=decay if self.decay is None else self.decay,
-            batch=batch if self.batch is None else self.batch,
+            rate=self.rate or rate,
+            decay=decay if self.decay < 0.0 else self.decay,
+            batch=self.batch or batch,
         )
 
 
@@ -127,9 +127,9 @@ def train(
     network = new_network(settings.model, data, rows)
     network.to(where)
     learned, judged = (_examples(network, r, where) for r in (rows, judge))
-    optimizer = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=settings.decay)  # type: ignore[arg-type]
+    optimizer = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=settings.decay)
     job = identity_of(settings, rows, judge)
-    state = State({part: [] for part in network.parts}, {part: 0 for part in network.parts}, _copy(network))
+    state = State({part: [] for part in network.parts}, dict.fromkeys(network.parts, 0), _copy(network))
     if resume and checkpoint is not None and checkpoint.exists():
         state = load_checkpoint(checkpoint, job, network, optimizer)
     interrupted = False
@@ -213,7 +213,7 @@ def _epoch(
     network.train()
     sums = dict.fromkeys(network.parts, 0.0)
     order = torch.randperm(len(learned["label"]))
-    batches = order.split(settings.batch)  # type: ignore[arg-type]
+    batches = order.split(settings.batch)
     for batch in batches:
         losses = _losses(network, {name: t[batch.to(t.device)] for name, t in learned.items()}, training=True)
         optimizer.zero_grad()
