@@ -32,7 +32,7 @@ COMPONENTS = 24
 BRIGHTNESS = 0.2
 """Mean luminance that pictures are brought to: their exposure is not known anyway."""
 
-LEAST_PIXELS = 64
+LEAST_PIXELS = 32
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 REVISION = 1
@@ -96,7 +96,7 @@ def prepared(linear: NDArray) -> NDArray[np.float32]:
         raise UsdfabError(f"expected an RGB picture (H, W, 3), got an array of shape {pixels.shape}")
     side = min(pixels.shape[:2])
     if side < LEAST_PIXELS:
-        raise UsdfabError(f"{pixels.shape[1]} x {pixels.shape[0]} pixels are too few", remedy="give at least 64 x 64")
+        raise UsdfabError(f"{pixels.shape[1]} x {pixels.shape[0]} pixels are too few", remedy="give at least 32 x 32")
     if not np.isfinite(pixels).all():
         raise UsdfabError("the picture holds numbers that are not finite")
     top, left = ((n - side) // 2 for n in pixels.shape[:2])
@@ -179,6 +179,9 @@ def gram(texture: Tensor, components: Sequence[int]) -> Tensor:
 
 def split(texture: Tensor, components: Sequence[int]) -> list[tuple[Tensor, Tensor, int]]:
     """For each level and tap of texture vectors (B, D): means (B, q), whole covariances (B, q, q), q."""
+    wanted = sum(q + q * (q + 1) // 2 for q in components)
+    if texture.shape[1] != wanted:
+        raise UsdfabError(f"texture vectors have {texture.shape[1]} numbers, not {wanted}")
     found, at = [], 0
     for q in components:
         rows, columns = torch.triu_indices(q, q)
@@ -188,8 +191,6 @@ def split(texture: Tensor, components: Sequence[int]) -> list[tuple[Tensor, Tens
         covariance[:, columns, rows] = upper
         found.append((mean, covariance, q))
         at += q + len(rows)
-    if at != texture.shape[1]:
-        raise UsdfabError(f"texture vectors have {texture.shape[1]} numbers, not {at}")
     return found
 
 

@@ -51,7 +51,9 @@ class Reduced(nn.Module):
         x = ((rows - self.mean) * self.scale).clamp(-6.0, 6.0)
         variances, vectors = principal(x, self.directions.shape[1])
         # Late components are mostly noise: whitened only half, they count less.
-        self.directions = vectors * (variances.clamp(min=1e-6) * variances[0]) ** -0.25
+        reduced = vectors * (variances.clamp(min=1e-6) * variances[0]) ** -0.25
+        # A small vector has fewer components than are asked for; the others are 0.
+        self.directions = F.pad(reduced, (0, self.directions.shape[1] - reduced.shape[1]))
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, components) of (B, size), of magnitude 1 or less."""

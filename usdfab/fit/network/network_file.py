@@ -28,6 +28,9 @@ SHIPPED = Path(__file__).parent.parent / "weights" / "network_robust.safetensors
 SHIPPED_SHA256 = ""
 """Of the shipped weights, checked at each load."""
 
+LARGE = 1000
+"""Matrices of so many numbers are kept as half floats; means and scales, whose range is wide, are not."""
+
 _AGAIN = "train it anew: usdfab train fit-network"
 
 
@@ -74,8 +77,7 @@ def save_network(weights: Weights, path: Path) -> None:
     """
     tensors = {f"network.{name}": tensor for name, tensor in weights.network.state_dict().items()}
     tensors |= weights.basis.tensors()
-    # Means and scales have a wide range; what is large in number is small in value.
-    stored = {name: t.half() if t.ndim > 1 else t.float() for name, t in tensors.items()}
+    stored = {name: t.half() if t.numel() >= LARGE and t.ndim > 1 else t.float() for name, t in tensors.items()}
     about = interface() | {"about": json.dumps(weights.about, sort_keys=True)}
     try:
         with whole_file(path) as temporary:
@@ -140,6 +142,6 @@ def rounded(weights: Weights) -> Weights:
     """The same with the numbers that a file keeps."""
     with torch.no_grad():
         for tensor in weights.network.state_dict().values():
-            if tensor.ndim > 1:
+            if tensor.numel() >= LARGE and tensor.ndim > 1:
                 tensor.copy_(tensor.half())
     return weights

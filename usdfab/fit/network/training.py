@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -134,7 +135,7 @@ def train(
         state = load_checkpoint(checkpoint, job, network, optimizer)
     interrupted = False
     try:
-        with deterministic():
+        with deterministic(), one_thread():
             while state.epoch < settings.epochs:
                 state = _epoch(network, optimizer, learned, judged, settings, state)
                 if checkpoint and state.epoch % SAVE_EVERY == 0:
@@ -149,6 +150,17 @@ def train(
     network.load_state_dict(state.best)
     network.eval().to("cpu")
     return Trained(network, state.history, state.best_epoch, len(rows.index.unique()), interrupted)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Small matrices: threads cost more than they bring, and where others compute too, thirteen times as much."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def checked_device(device: str) -> torch.device:
