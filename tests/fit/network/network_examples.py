@@ -26,9 +26,9 @@ TEXTURE = 3 * sum(q + q * (q + 1) // 2 for q in COMPONENTS)
 
 
 def basis() -> Basis:
-    """Of a network with 5 and 4 channels."""
+    """Of a network with 4 and 6 channels, such as ``net``."""
     rng = np.random.default_rng(1)
-    shapes = [(5, COMPONENTS[0]), (4, COMPONENTS[1])]
+    shapes = [(4, COMPONENTS[0]), (6, COMPONENTS[1])]
     return Basis(
         tuple(torch.from_numpy(rng.normal(size=s[0])).float() for s in shapes),
         tuple(torch.from_numpy(rng.normal(size=s)).half().float() for s in shapes),

@@ -115,6 +115,7 @@ def predict(photo: NDArray, weights: Weights, net: FeatureNet | None = None) -> 
         # Turned pictures have the same spectra, with the axes exchanged.
         spectra = torch.from_numpy(axis_spectra(maps)).float()[None]
         odds = network.count_probabilities(spectra)[0].double().numpy()
+        odds /= odds.sum(axis=1, keepdims=True)
         rough = FREQUENCIES[odds.argmax(axis=1)]
         found = refined(maps, (float(rough[0]), float(rough[1])))
         exact = np.array([f.cycles for f in found])
