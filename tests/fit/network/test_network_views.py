@@ -16,7 +16,7 @@ from usdfab.fabric.sampling_wide import sample_class, sample_wide
 from usdfab.fabric.weave import NAMED_WEAVES, PAPER_WEAVES, twill
 from usdfab.fit.network.labels import FAMILIES, LABELS, family_of, typical_weave, weave_label
 from usdfab.fit.network.targets import INDEX, NAMES, TARGETS, decode, encode
-from usdfab.fit.network.turns import TURNS, Turn, cropped, recolored
+from usdfab.fit.network.turns import TURNS, Turn, Unevenness, cropped, recolored, sample_unevenness, uneven
 from usdfab.fit.network.views import view
 
 
@@ -71,6 +71,25 @@ def test_channels_drawn_anew() -> None:
     assert shown.weft.albedo == (0.9, 0.9, 0.7)
     assert shown.warp.yarn_albedo == ((0.3, 0.3, 0.1), (0.6, 0.6, 0.4))
     np.testing.assert_array_equal(pixels, drawdown(recolored(drawdown(cloth()), cloth(), (2, 2, 0))[1]))
+
+
+def test_uneven_cloth_keeps_its_mean_spacing() -> None:
+    fabric = cloth("plain", 10, 14)
+    pixels = drawdown(fabric, 20).astype(np.float32)
+    same = uneven(pixels, fabric, Unevenness(), np.random.default_rng(0))
+    np.testing.assert_allclose(same, pixels, atol=1e-6)
+    # Borders between columns of a row of plain weave lie where yarns meet.
+    shifts, gains = [], []
+    for seed in range(30):
+        moved = uneven(pixels, fabric, Unevenness((0.1, 0.0)), np.random.default_rng(seed))
+        borders = np.flatnonzero(np.abs(np.diff(moved[5, :, 0])) > 0.25)
+        places = [borders[np.abs(borders - 20 * k).argmin()] + 1 for k in range(1, 10)]
+        shifts.append(np.array(places) - 20.0 * np.arange(1, 10))
+        bright = uneven(pixels, fabric, Unevenness(gain=(0.0, 0.2)), np.random.default_rng(seed))
+        gains.append(np.log(bright[10::20, 5, 0] / pixels[10::20, 5, 0]))
+    assert abs(np.mean(shifts)) < 0.4 and np.std(shifts) == pytest.approx(2.0, rel=0.25)
+    assert abs(np.mean(gains)) < 0.04 and np.std(gains) == pytest.approx(0.2, rel=0.25)
+    assert 0.0 <= sample_unevenness(np.random.default_rng(1)).bend <= 0.5
 
 
 def test_views_are_the_same_each_time_and_the_first_is_the_render() -> None:

@@ -1,4 +1,4 @@
-"""Views of a data set's samples as training sees them: turned, cropped, recoloured, photographed. A pure function."""
+"""Views of a data set's samples as training sees them: turned, cropped, recoloured, uneven, photographed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from usdfab.fabric import FabricParameters
 from usdfab.fit.dataset.augment import Camera, photographed, sample_camera
 from usdfab.fit.network.inputs import prepared
-from usdfab.fit.network.turns import TURNS, cropped, recolored
+from usdfab.fit.network.turns import TURNS, cropped, recolored, sample_unevenness, uneven
 from usdfab.srgb import srgb_to_linear
 
 REVISION = 1
@@ -41,6 +41,7 @@ def view(
         least = LEAST_YARNS / min(fabric.warp.count, fabric.weft.count)
         share = rng.uniform(min(1.0, max(SMALLEST_CROP, least)), 1.0)
         pixels, fabric = cropped(pixels, fabric, share, (float(rng.random()), float(rng.random())))
+    pixels = uneven(pixels, fabric, sample_unevenness(rng), rng)
     shown = photographed(np.ascontiguousarray(turn.picture(pixels)), scaled(sample_camera(rng), pixels), rng)
     return prepared(srgb_to_linear(shown)), turn.fabric(fabric)
 
