@@ -45,7 +45,18 @@ def made(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     network = net(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(inputs, "feature_net", lambda *_: network)
-        options = ["--epochs", "2", "--views", "2", "--curves", str(folder / "curves"), "--learning-curve", "-q"]
+        options = [
+            "--epochs",
+            "2",
+            "--views",
+            "2",
+            "--drawn",
+            "1",
+            "--curves",
+            str(folder / "curves"),
+            "--learning-curve",
+            "-q",
+        ]
         assert _run(["train", "fit-network", str(dataset), "-o", str(folder / "w.safetensors"), *options]) == 0
     return folder
 
@@ -54,13 +65,14 @@ def test_what_is_written(made: Path, dataset: Path, run: Run) -> None:
     names = sorted(p.name for p in made.iterdir())
     assert names == ["curves", "net.safetensors", "w.inputs", "w.safetensors"]
     assert sorted(p.name for p in (made / "curves").iterdir()) == ["counts.png", "numbers.png", "weave.png"]
-    # A basis and twelve samples.
-    assert len(list((made / "w.inputs").iterdir())) == 13
+    # A basis, twelve samples and a file of drawn cloths.
+    assert len(list((made / "w.inputs").iterdir())) == 14
     code, out, err = run("train", "fit-network", dataset, "-o", made / "w.safetensors", "--epochs", 2, "--views", 2,
-                         "--overwrite", "--json", "-q")  # fmt: skip
+                         "--drawn", 1, "--overwrite", "--json", "-q")  # fmt: skip
     assert (code, err) == (0, "")
     about = json.loads(out)["about"]
     assert about["model"] == "robust" and about["data"]["training_samples"] == 8 and about["data"]["samples"] == 12
+    assert about["data"]["drawn"] == 50
     assert about["data"]["size"] == 64 and about["data"]["spp"] == 1 and set(about["skill"]) >= {"count", "crimp"}
 
 
@@ -108,7 +120,7 @@ def test_the_papers_model(made: Path, dataset: Path, run: Run, tmp_path: Path) -
 def test_a_data_set_that_grows_adds_to_the_inputs(dataset: Path, run: Run, tmp_path: Path) -> None:
     root = tmp_path / "set"
     drawn_dataset(root, 12)
-    options = ("--epochs", 1, "--views", 1, "-q", "--overwrite")
+    options = ("--epochs", 1, "--views", 1, "--drawn", 0, "-q", "--overwrite")
     assert run("train", "fit-network", root, "-o", tmp_path / "w.safetensors", *options)[0] == 0
     before = {p.name: p.read_bytes() for p in (tmp_path / "w.inputs").iterdir()}
     drawn_dataset(root, 14)
@@ -127,7 +139,7 @@ def test_bad_input(made: Path, dataset: Path, run: Run, tmp_path: Path, monkeypa
     new = tmp_path / "new.safetensors"
 
     def train(*more: object, root: Path = dataset, output: Path = new) -> tuple[int, str, str]:
-        return run("train", "fit-network", root, "-o", output, "--epochs", 1, "--views", 1, "-q", *more)
+        return run("train", "fit-network", root, "-o", output, "--epochs", 1, "--views", 1, "--drawn", 0, "-q", *more)
 
     import torch
 
@@ -140,6 +152,7 @@ def test_bad_input(made: Path, dataset: Path, run: Run, tmp_path: Path, monkeypa
     one_line(train("--curves", made), "something in the way")
     one_line(run("train", "fit-network", dataset, "-o", new, "--epochs", 0), "0 epochs are none")
     one_line(run("train", "fit-network", dataset, "-o", new, "--views", 0), "0 views are none")
+    one_line(train("--drawn", -1), "-1 drawn cloths cannot be")
     one_line(run("evaluate", "network", made / "w.safetensors"), "a data set or --photos")
     one_line(run("evaluate", "network", made / "none.safetensors", dataset), "no such file")
     one_line(run("evaluate", "raster", "--photos", tmp_path), "takes no data set")
@@ -150,7 +163,8 @@ def test_data_sets_that_cannot_be_learned_from(dataset: Path, made: Path, run: R
     root = tmp_path / "set"
 
     def train(name: str) -> tuple[int, str, str]:
-        return run("train", "fit-network", root, "-o", tmp_path / f"{name}.safetensors", "--epochs", 1, "--views", 1)
+        return run("train", "fit-network", root, "-o", tmp_path / f"{name}.safetensors", "--epochs", 1, "--views", 1,
+                   "--drawn", 0)  # fmt: skip
 
     shutil.copytree(dataset, root)
     manifest = root / "dataset.json"
@@ -177,7 +191,8 @@ def test_inputs_of_something_else_are_refused(dataset: Path, made: Path, run: Ru
     shutil.copytree(made / "w.inputs", kept)
 
     def train() -> tuple[int, str, str]:
-        return run("train", "fit-network", dataset, "-o", tmp_path / "w.safetensors", "--inputs", kept, "--views", 2)
+        return run("train", "fit-network", dataset, "-o", tmp_path / "w.safetensors", "--inputs", kept, "--views", 2,
+                   "--drawn", 0)  # fmt: skip
 
     sample = kept / "000004.safetensors"
     content = sample.read_bytes()
@@ -203,6 +218,8 @@ def test_a_full_disk_keeps_what_was_computed(
         real(*arguments)
 
     monkeypatch.setattr(store, "save_file", full)
+    # Nothing is drawn after such an error.
+    monkeypatch.setattr(store, "drawn_cloth", None)
     output = tmp_path / "w.safetensors"
     result = run("train", "fit-network", dataset, "-o", output, "--epochs", 1, "--views", 1, "-q")
     one_line(result, "the disk is full")

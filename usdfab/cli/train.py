@@ -22,6 +22,7 @@ def run(
     ] = "robust",
     epochs: Annotated[int | None, Parameter(help="60 for robust, 400 for paper by default.")] = None,
     views: Annotated[int, Parameter(help="Of each sample: the render, and turned, cropped and photographed.")] = 8,
+    drawn: Annotated[int, Parameter(help="Drawn cloths that robust also learns counts and weaves from.")] = 1500,
     inputs: Annotated[Path | None, Parameter(help="Folder that keeps what is computed of each view.")] = None,
     learning_curve: Annotated[
         bool, Parameter(negative="", help="Also train on a quarter and on half of the samples, and compare.")
@@ -53,6 +54,8 @@ def run(
     dataset:
         A folder of ``usdfab dataset fabrics``.
     """
+    from dataclasses import replace
+
     from usdfab.errors import UsdfabError
     from usdfab.files import checked_output
     from usdfab.fit.extra import require_fit_extra
@@ -64,7 +67,7 @@ def run(
     from usdfab.fit.network.fit import DEFAULT_EPOCHS, fit_network
     from usdfab.fit.network.inputs import feature_net
     from usdfab.fit.network.network_file import save_network
-    from usdfab.fit.network.store import prepare
+    from usdfab.fit.network.store import draw_inputs, prepare
     from usdfab.fit.network.training import TrainSettings, checked_device
 
     settings = TrainSettings(model, DEFAULT_EPOCHS[model] if epochs is None else epochs, seed)
@@ -75,6 +78,9 @@ def run(
     folder = inputs or output.with_name(f"{output.stem}.inputs")
     with progress_bar("computing inputs", quiet=quiet) as update:
         data = prepare(dataset, folder, feature_net(fast_dtype()), views, progress=update)
+    if model == "robust" and drawn:
+        with progress_bar("drawing cloth", quiet=quiet) as update:
+            data = replace(data, drawn=draw_inputs(folder, drawn, update))
     with progress_bar("training", quiet=quiet) as update:
         fitted = fit_network(
             data, settings, device=str(where), checkpoint=state, resume=resume, learning_curve=learning_curve,

@@ -18,7 +18,7 @@ from usdfab.fit.features import FeatureNet
 from usdfab.fit.network.inputs import Basis
 from usdfab.fit.network.labels import LABELS
 from usdfab.fit.network.spectra import BINS, FREQUENCIES, LATTICE_SIZE
-from usdfab.fit.network.store import Prepared, Rows
+from usdfab.fit.network.store import Drawn, Prepared, Rows
 from usdfab.fit.network.targets import TARGETS
 
 COMPONENTS = (3, 2)
@@ -65,6 +65,12 @@ def rows(samples: int = 60, views: int = 2, seed: int = 0) -> Rows:
         known=torch.ones(count, 2, len(TARGETS), dtype=torch.bool),
         **{name: torch.from_numpy(value).float() for name, value in as_float.items()},
     )
+
+
+def drawn_rows(count: int = 100) -> Drawn:
+    """The same signs without the texture."""
+    some = rows(count, 1, seed=4)
+    return Drawn(some.spectra, some.lattice, some.values[:, :, 0], some.label)
 
 
 def prepared_rows(samples: int = 60, views: int = 2) -> Prepared:

@@ -12,10 +12,14 @@ from network_examples import net
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric.weave import NAMED_WEAVES
+from usdfab.fit.network import store
+from usdfab.fit.network.drawn import drawn_cloth
 from usdfab.fit.network.inputs import BRIGHTNESS, LEVELS, even, fitted_basis, gram, prepared, texture_vectors
 from usdfab.fit.network.spectra import (
+    BINS,
     FREQUENCIES,
     LATTICE_SHAPE,
+    LATTICE_SIZE,
     axis_spectra,
     lattice_spectrum,
     refined,
@@ -125,6 +129,36 @@ def test_even_statistics_have_unit_correlations() -> None:
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-6)
     with pytest.raises(UsdfabError, match="numbers"):
         even(texture[:, :4], (2,))
+
+
+def test_drawn_cloth_shows_the_fabric_that_it_is_said_to_show() -> None:
+    """Its crossings have the colours of the yarns that the weave puts on top; the analysis reads its counts."""
+    counted = 0
+    for seed in range(4):
+        pixels, fabric = drawn_cloth(np.random.default_rng(seed))
+        again, same = drawn_cloth(np.random.default_rng(seed))
+        np.testing.assert_array_equal(pixels, again)
+        assert fabric == same and pixels.shape == (256, 256, 3) and np.isfinite(pixels).all() and pixels.min() >= 0.0
+        maps = texture_maps(prepared(pixels))
+        for frequency, yarn in zip(refined(maps, (fabric.warp.count, fabric.weft.count)), (fabric.warp, fabric.weft),
+                                   strict=True):  # fmt: skip
+            counted += abs(frequency.cycles / yarn.count - 1.0) < 0.03
+    assert counted >= 7
+
+
+def test_drawn_inputs_are_kept_and_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "DRAWN_CHUNK", 2)
+    first = store.draw_inputs(tmp_path, 3)
+    assert len(first) == 4 and first.spectra.shape == (4, 2, 3, BINS) and first.lattice.shape == (4, LATTICE_SIZE)
+    monkeypatch.setattr(store, "drawn_cloth", None)
+    again = store.draw_inputs(tmp_path, 4)
+    assert torch.equal(first.lattice, again.lattice) and torch.equal(first.label, again.label)
+    assert len(store.draw_inputs(tmp_path, 0)) == 0
+    with pytest.raises(UsdfabError, match="drawn cloths cannot be"):
+        store.draw_inputs(tmp_path, -1)
+    (tmp_path / "drawn-0001.safetensors").write_bytes((tmp_path / "drawn-0000.safetensors").read_bytes())
+    with pytest.raises(UsdfabError, match="made otherwise"):
+        store.draw_inputs(tmp_path, 4)
 
 
 def test_prepared_pictures_are_square_and_evenly_bright() -> None:

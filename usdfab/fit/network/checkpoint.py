@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from usdfab.errors import UsdfabError
 from usdfab.files import whole_file
-from usdfab.fit.network.store import Rows, refused
+from usdfab.fit.network.store import Drawn, Rows, refused
 
 if TYPE_CHECKING:
     from usdfab.fit.network.training import TrainSettings
@@ -38,11 +38,11 @@ class State:
     epoch: int = 0
 
 
-def identity_of(settings: TrainSettings, rows: Rows, judge: Rows) -> str:
+def identity_of(settings: TrainSettings, *parts: Rows | Drawn | None) -> str:
     """A checksum of everything that training depends on."""
     digest = hashlib.sha256(json.dumps(asdict(settings), sort_keys=True).encode())
-    for part in (rows, judge):
-        for name in part.__dataclass_fields__:
+    for part in parts:
+        for name in part.__dataclass_fields__ if part is not None else ():
             digest.update(getattr(part, name).contiguous().numpy().tobytes())
     return digest.hexdigest()
 

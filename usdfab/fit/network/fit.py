@@ -77,6 +77,7 @@ def _weights(data: Prepared, settings: TrainSettings, found: Trained) -> Weights
             "samples": data.samples,
             "training_samples": found.training_samples,
             "views": int(data.rows.number.max()) + 1,
+            "drawn": 0 if data.drawn is None or settings.model == "paper" else len(data.drawn),
             **{name: getattr(data.settings, name) for name in ("prior", "seed", "size", "spp", "denoised")},
         },
     }

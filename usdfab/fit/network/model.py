@@ -165,6 +165,10 @@ class Robust(nn.Module):
         """What weave and numbers take, (B, components)."""
         return torch.cat([self.texture(even(texture, self.components)), self.lattice(lattice)], dim=1)
 
+    def blinded(self, x: Tensor, which: Tensor) -> Tensor:
+        """What weave and numbers take, with the texture of some rows (B,) replaced by the mean texture."""
+        return torch.cat([x[:, :TEXTURE_COMPONENTS].masked_fill(which[:, None], 0.0), x[:, TEXTURE_COMPONENTS:]], dim=1)
+
     def standardised(self, values: Tensor) -> Tensor:
         """Targets (..., 2, P) less their mean, over their scale."""
         return (values - self.target_mean) / self.target_scale

@@ -27,12 +27,13 @@ from usdfab.fit.dataset.reader import Stored, read_dataset
 from usdfab.fit.dataset.settings import Settings, settings_of
 from usdfab.fit.dataset.store import MANIFEST, read_manifest
 from usdfab.fit.features import FeatureNet
-from usdfab.fit.network.inputs import LEVELS, Basis, fitted_basis, prepared, texture_vectors
+from usdfab.fit.network.drawn import REVISION as DRAWN_REVISION, drawn_cloth
+from usdfab.fit.network.inputs import LEVELS, REVISION as INPUT_REVISION, Basis, fitted_basis, prepared, texture_vectors
 from usdfab.fit.network.labels import LABELS, weave_label
-from usdfab.fit.network.spectra import LATTICE_SIZE, axis_spectra, lattice_spectrum, refined, texture_maps
+from usdfab.fit.network.spectra import BINS, LATTICE_SIZE, axis_spectra, lattice_spectrum, refined, texture_maps
 from usdfab.fit.network.splits import split_of
 from usdfab.fit.network.targets import encode, targets_hash
-from usdfab.fit.network.views import REVISION as VIEW_REVISION, view
+from usdfab.fit.network.views import REVISION as VIEW_REVISION, as_photographed, view
 
 FORMAT = "usdfab-network-inputs/1"
 BASIS = "basis.safetensors"
@@ -41,6 +42,8 @@ BASIS_PICTURES = 48
 
 HINT_SIGMA = 0.02
 """Relative error of the counts by which the lattice spectrum is found in training; with a network they are its own."""
+
+DRAWN_CHUNK = 50
 
 Progress = Callable[[int, int], None]
 
@@ -87,12 +90,13 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A data set as the network sees it. ``settings`` are the data set's; ``place`` names it."""
+    """A data set as the network sees it, drawn cloth beside it. ``settings`` are the data set's; ``place`` names it."""
 
     settings: Settings
     basis: Basis
     rows: Rows
     place: str
+    drawn: Drawn | None = None
 
     @property
     def samples(self) -> int:
@@ -213,6 +217,76 @@ def _rows(parts: list[dict[str, NDArray]]) -> Rows:
     ):
         raise UsdfabError("the inputs hold numbers that are not finite, or too few", remedy="remove their folder")
     return rows
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """Drawn cloth for what reads lattices, R pictures; see ``Rows``. ``counts`` (R, 2) are log counts."""
+
+    spectra: Tensor
+    lattice: Tensor
+    counts: Tensor
+    label: Tensor
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+
+def draw_inputs(folder: str | Path, count: int, progress: Progress | None = None) -> Drawn:
+    """Inputs of ``count`` drawn cloths, kept in ``folder`` in files of ``DRAWN_CHUNK``; rounded up to whole files.
+
+    Raises
+    ------
+    UsdfabError
+        If a file there is something else or the disk refuses.
+    """
+    if count < 0:
+        raise UsdfabError(f"{count} drawn cloths cannot be", place="--drawn", remedy="give 0 or more")
+    target = Path(folder)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise refused(error, target) from error
+    chunks = -(-count // DRAWN_CHUNK)
+    parts = []
+    for chunk in range(chunks):
+        if progress:
+            progress(chunk, chunks)
+        parts.append(_drawn_chunk(target / f"drawn-{chunk:04d}.safetensors", chunk))
+
+    def joined(name: str, shape: tuple[int, ...]) -> Tensor:
+        tensor = torch.from_numpy(np.concatenate([p[name] for p in parts]) if parts else np.zeros((0, *shape)))
+        return tensor.long() if name == "label" else tensor.float()
+
+    return Drawn(
+        joined("spectra", (2, 3, BINS)), joined("lattice", (LATTICE_SIZE,)), joined("counts", (2,)), joined("label", ())
+    )
+
+
+def _drawn_chunk(path: Path, chunk: int) -> dict[str, NDArray]:
+    about = {
+        "format": FORMAT, "kind": "drawn", "chunk": str(chunk), "labels": json.dumps(LABELS),
+        "revision": json.dumps([DRAWN_REVISION, VIEW_REVISION, INPUT_REVISION]),
+    }  # fmt: skip
+    if path.exists():
+        return _read(path, about)[0]
+    rows = []
+    for number in range(chunk * DRAWN_CHUNK, (chunk + 1) * DRAWN_CHUNK):
+        rng = np.random.default_rng([number, 2])
+        pixels, fabric = drawn_cloth(rng)
+        maps = texture_maps(prepared(as_photographed(pixels, fabric, rng)))
+        counts = np.array([fabric.warp.count, fabric.weft.count])
+        warp, weft = (float(c) for c in counts * np.exp(rng.normal(0.0, HINT_SIGMA, 2)))
+        rows.append(
+            {
+                "spectra": axis_spectra(maps).astype(np.float16), "counts": np.log(counts).astype(np.float32),
+                "lattice": lattice_spectrum(maps, *refined(maps, (warp, weft))).ravel().astype(np.float16),
+                "label": np.int64(LABELS.index(weave_label(fabric.weave))),
+            }
+        )  # fmt: skip
+    joined = {name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]}
+    _write(path, joined, about)
+    return joined
 
 
 def component_counts(basis: Basis) -> tuple[int, ...]:

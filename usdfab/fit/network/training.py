@@ -17,10 +17,10 @@ from usdfab.errors import UsdfabError
 from usdfab.fabric.weave import PAPER_WEAVES
 from usdfab.fit.descent import deterministic
 from usdfab.fit.network.checkpoint import State, identity_of, load_checkpoint, save_checkpoint
-from usdfab.fit.network.model import Paper, Robust, bin_targets
+from usdfab.fit.network.model import TEXTURE_COMPONENTS, Paper, Robust, bin_targets
 from usdfab.fit.network.paper import NUMBERS, shares
 from usdfab.fit.network.spectra import BIN_WIDTH, HIGH, LOW
-from usdfab.fit.network.store import Prepared, Rows, component_counts
+from usdfab.fit.network.store import Drawn, Prepared, Rows, component_counts
 
 MODELS = ("robust", "paper")
 SAVE_EVERY = 10
@@ -31,6 +31,12 @@ MAX_SHIFT = 8
 
 HINT_NOISE = 0.03
 """Relative error of the counts that the numbers' part is given in training."""
+
+BLIND = 0.3
+"""Part of the renders whose texture the weave's part does not see in training: drawn cloth has none that is true."""
+
+DRAWN_SHARE = 0.5
+"""Weight of drawn cloth in the losses of counts and weave, if there is any."""
 
 INPUT_NOISE = 0.03
 LABEL_SMOOTHING = 0.05
@@ -128,8 +134,9 @@ def train(
     network = new_network(settings.model, data, rows)
     network.to(where)
     learned, judged = (_examples(network, r, where) for r in (rows, judge))
+    drawn = _drawn_examples(network, data.drawn, where)
     optimizer = torch.optim.AdamW(network.parameters(), settings.rate, weight_decay=settings.decay)
-    job = identity_of(settings, rows, judge)
+    job = identity_of(settings, rows, judge, data.drawn)
     state = State({part: [] for part in network.parts}, dict.fromkeys(network.parts, 0), _copy(network))
     if resume and checkpoint is not None and checkpoint.exists():
         state = load_checkpoint(checkpoint, job, network, optimizer)
@@ -137,7 +144,7 @@ def train(
     try:
         with deterministic(), one_thread():
             while state.epoch < settings.epochs:
-                state = _epoch(network, optimizer, learned, judged, settings, state)
+                state = _epoch(network, optimizer, learned, judged, drawn, settings, state)
                 if checkpoint and state.epoch % SAVE_EVERY == 0:
                     save_checkpoint(checkpoint, job, network, optimizer, state)
                 if progress:
@@ -214,9 +221,19 @@ def _examples(network: Robust | Paper, rows: Rows, where: torch.device) -> Examp
     return {name: tensor.to(where) for name, tensor in found.items()}
 
 
+def _drawn_examples(network: Robust | Paper, drawn: Drawn | None, where: torch.device) -> Examples | None:
+    if drawn is None or not len(drawn) or isinstance(network, Paper):
+        return None
+    with torch.no_grad():
+        lattice = network.lattice(drawn.lattice.to(where))
+        # The mean texture is 0 here.
+        x = F.pad(lattice, (TEXTURE_COMPONENTS, 0))
+    return {"x": x, **{name: getattr(drawn, name).to(where) for name in ("spectra", "counts", "label")}}
+
+
 def _epoch(
     network: Robust | Paper, optimizer: torch.optim.Optimizer, learned: Examples, judged: Examples,
-    settings: TrainSettings, state: State,
+    drawn: Examples | None, settings: TrainSettings, state: State,
 ) -> State:  # fmt: skip
     # Each epoch has random numbers of its own, so that it does not matter whether a run was interrupted before.
     torch.manual_seed(hash((settings.seed, state.epoch)) % 2**31)
@@ -228,6 +245,13 @@ def _epoch(
     batches = order.split(settings.batch)
     for batch in batches:
         losses = _losses(network, {name: t[batch.to(t.device)] for name, t in learned.items()}, training=True)
+        if drawn is not None and isinstance(network, Robust):
+            some = torch.randint(len(drawn["label"]), (settings.batch,))
+            more = _lattice_losses(network, {name: t[some.to(t.device)] for name, t in drawn.items()}, training=True)
+            losses = {
+                part: (1.0 - DRAWN_SHARE) * loss + DRAWN_SHARE * more[part] if part in more else loss
+                for part, loss in losses.items()
+            }
         optimizer.zero_grad()
         sum(losses.values(), start=torch.zeros((), device=learned["label"].device)).backward()
         nn.utils.clip_grad_norm_(network.parameters(), 5.0)
@@ -258,18 +282,11 @@ def _losses(network: Robust | Paper, batch: Examples, *, training: bool) -> dict
         # L1 of the numbers as in the paper; the cross entropy beside it is an order larger.
         return {"paper": 0.1 * F.cross_entropy(logits, batch["label"]) + (found - batch["shares"]).abs().mean()}
     counts = batch["values"][:, :, 0]
-    x = batch["x"]
-    spectra, moved, hint = batch["spectra"], counts, counts
+    losses = _lattice_losses(network, batch | {"counts": counts}, training=training)
+    x, hint = batch["x"], counts
     if training:
-        spectra, moved = shifted(spectra, counts)
         hint = counts + HINT_NOISE * torch.randn_like(counts)
         x = x + INPUT_NOISE * torch.randn_like(x)
-    logits = network.counts(spectra)
-    count_loss = F.cross_entropy(logits.flatten(0, 1), bin_targets(moved).flatten(0, 1))
-    weave = network.weave(x)
-    smoothing = LABEL_SMOOTHING if training else 0.0
-    labels = batch["label"].expand(len(weave), -1).flatten()
-    weave_loss = F.cross_entropy(weave.flatten(0, 1), labels, label_smoothing=smoothing)
     means, log_variances = network.number_outputs(x, hint)
     wanted = network.standardised(batch["values"])
     nll = 0.5 * (log_variances + (means - wanted).square() * (-log_variances).exp())
@@ -277,7 +294,24 @@ def _losses(network: Robust | Paper, batch: Examples, *, training: bool) -> dict
         # Seitzer et al. 2022, beta-NLL: without it, what is hard is called uncertain instead of being learned.
         nll = nll * (0.5 * log_variances).exp().detach()
     known = batch["known"].float().expand_as(nll)
-    return {"counts": count_loss, "weave": weave_loss, "numbers": (nll * known).sum() / known.sum()}
+    return losses | {"numbers": (nll * known).sum() / known.sum()}
+
+
+def _lattice_losses(network: Robust, batch: Examples, *, training: bool) -> dict[str, Tensor]:
+    """Of the parts that drawn cloth teaches, too: counts and weave."""
+    x, spectra, counts = batch["x"], batch["spectra"], batch["counts"]
+    if training:
+        spectra, counts = shifted(spectra, counts)
+        x = network.blinded(x, torch.rand(len(x), device=x.device) < BLIND)
+        x = x + INPUT_NOISE * torch.randn_like(x)
+    logits = network.counts(spectra)
+    weave = network.weave(x)
+    labels = batch["label"].expand(len(weave), -1).flatten()
+    smoothing = LABEL_SMOOTHING if training else 0.0
+    return {
+        "counts": F.cross_entropy(logits.flatten(0, 1), bin_targets(counts).flatten(0, 1)),
+        "weave": F.cross_entropy(weave.flatten(0, 1), labels, label_smoothing=smoothing),
+    }
 
 
 def shifted(spectra: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:

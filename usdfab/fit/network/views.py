@@ -41,9 +41,16 @@ def view(
         least = LEAST_YARNS / min(fabric.warp.count, fabric.weft.count)
         share = rng.uniform(min(1.0, max(SMALLEST_CROP, least)), 1.0)
         pixels, fabric = cropped(pixels, fabric, share, (float(rng.random()), float(rng.random())))
-    pixels = uneven(pixels, fabric, sample_unevenness(rng), rng)
-    shown = photographed(np.ascontiguousarray(turn.picture(pixels)), scaled(sample_camera(rng), pixels), rng)
-    return prepared(srgb_to_linear(shown)), turn.fabric(fabric)
+    shown = turn.picture(as_photographed(pixels, fabric, rng))
+    return prepared(shown), turn.fabric(fabric)
+
+
+def as_photographed(
+    pixels: NDArray[np.float32], fabric: FabricParameters, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """A linear picture (H, W, 3) of ``fabric`` as a random camera shows it, decoded, its yarns a little uneven."""
+    shown = uneven(pixels, fabric, sample_unevenness(rng), rng)
+    return srgb_to_linear(photographed(shown, scaled(sample_camera(rng), pixels), rng))
 
 
 def scaled(camera: Camera, pixels: NDArray) -> Camera:
