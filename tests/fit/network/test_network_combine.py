@@ -111,7 +111,7 @@ def test_probabilities_of_the_weave_by_hand() -> None:
     mine[0] = 1.0
     found = combined_weave(mine, LABELS[1], 1.0)
     assert found.sum() == pytest.approx(1.0)
-    # DOUBT 0.15, and the analysis right with 0.85: the rest is shared by the ten other labels.
+    # WEAVE_DOUBT 0.15, and the analysis right with 0.85: the rest is shared by the ten other labels.
     assert found[0] / found[1] == pytest.approx((0.85 + 0.15 / 11) * 0.015 / (0.15 / 11 * 0.85))
     alone = combined_weave(mine, LABELS[1], 1.0, trusted=False)
     np.testing.assert_allclose(alone, 0.85 * mine + 0.15 / 11)

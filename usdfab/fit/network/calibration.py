@@ -22,6 +22,10 @@ def calibrate(network: Robust, rows: Rows) -> dict[str, float]:
     -------
     skill:
         For each target the root mean square error over that of the prior's mean, both systems together.
+
+    Notes
+    -----
+    Numbers are judged on fabrics of the wide prior, or all where there are none; counts and weave on all.
     """
     with torch.no_grad():
         for name in ("shrinkage", "widening", "weave_temperature", "count_temperature"):
@@ -41,17 +45,21 @@ def calibrate(network: Robust, rows: Rows) -> dict[str, float]:
         mean, deviation = network.number_estimates(x, hint)
         found, wanted = network.standardised(mean), network.standardised(rows.values)
         spread = deviation / network.target_scale
+        # Photos are like the wide prior's cloth. In Table 4 the weave tells much else, by how it was drawn.
         known = rows.known.float()
+        judged = known * (~rows.table4[:, None, None]).float()
+        judged = judged if judged.any() else known
         # Least squares of the truth on the estimate, between no trust and full trust.
-        trust = _sum(found * wanted, known) / _sum(found * found, known).clamp(min=1e-9)
-        trust = trust.clamp(0.0, 1.0)
+        trust = (_sum(found * wanted, judged) / _sum(found * found, judged)).clamp(max=1.0)
         network.shrinkage.copy_(trust.expand(2, -1))
         error = trust * found - wanted
-        network.widening.copy_((_sum((error / spread).square(), known) / _sum(known, known)).sqrt().expand(2, -1))
-        # The prior's mean is 0 here.
-        skill = (_sum(error.square(), known) / _sum(wanted.square(), known).clamp(min=1e-9)).sqrt()
+        network.widening.copy_((_sum((error / spread).square(), judged) / _sum(judged, judged)).sqrt().expand(2, -1))
+        middle = (wanted * judged).sum(dim=(0, 1)) / judged.sum(dim=(0, 1)).clamp(min=1.0)
+        variation = _sum((wanted - middle).square(), judged)
+        skill = (_sum(error.square(), judged) / variation).sqrt()
     return dict(zip(NAMES, [round(float(s), 4) for s in skill], strict=True))
 
 
 def _sum(values: Tensor, known: Tensor) -> Tensor:
+    """Over rows and systems; 0 and less become a little more than 0."""
     return (values * known).sum(dim=(0, 1)).clamp(min=1e-9)

@@ -25,7 +25,7 @@ from usdfab.fit.network.targets import targets_hash
 
 FORMAT = "usdfab-network/1"
 SHIPPED = Path(__file__).parent.parent / "weights" / "network_robust.safetensors"
-SHIPPED_SHA256 = ""
+SHIPPED_SHA256 = "fa69f47394ba0383b089aeef924930252c6d0a309bfbc0c36af30092930dd593"
 """Of the shipped weights, checked at each load."""
 
 LARGE = 1000
