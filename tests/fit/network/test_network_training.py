@@ -40,7 +40,12 @@ def test_it_learns_what_the_inputs_hold_and_nothing_else(trained: Weights) -> No
     assert skill["irregularity"] < 0.8
     # The crimp is nowhere in the inputs: the estimate falls back to the prior's mean.
     assert 0.97 < skill["crimp"] < 1.03
-    assert float(trained.network.shrinkage[0, INDEX["crimp"]]) < 0.5  # type: ignore[union-attr, index]
+    network, test = trained.network, rows(80, seed=9)
+    assert isinstance(network, Robust)
+    with torch.no_grad():
+        x = network.reduced(test.texture, test.lattice)
+        spread = network.standardised(network.number_estimates(x, test.values[:, :, 0])[0]).std(dim=(0, 1))
+    assert float(spread[INDEX["crimp"]]) < 0.3 < float(spread[INDEX["irregularity"]])
     curve = trained.about["learning_curve"]
     sizes = sorted(map(int, curve))
     assert len(sizes) == 3 and sizes[0] < sizes[1] < sizes[2] == trained.about["data"]["training_samples"]
