@@ -10,8 +10,9 @@ from usdfab.errors import UsdfabError
 
 
 def run(
-    what: Literal["photos", "fits", "losses", "raster", "ablation", "path"],
+    what: Literal["photos", "fits", "losses", "raster", "ablation", "path", "network"],
     folder: Path | None = None,
+    dataset: Path | None = None,
     /,
     *,
     features: str = "vgg16",
@@ -24,6 +25,8 @@ def run(
     output: OptionalOutput = None,
     overwrite: Overwrite = False,
     stages: str = "analysis,match",
+    photos: Path | None = None,
+    analysis: bool = True,
     json: Json = False,
 ) -> None:
     """Judge usdfab's estimates on labelled photos or random fabrics, or the losses of the fit, and print a table.
@@ -36,6 +39,7 @@ def run(
         usdfab evaluate raster --count 1 --fibers 40
         usdfab evaluate ablation --fibers 40 -o ablation
         usdfab evaluate path --count 3 --seed 1
+        usdfab evaluate network weights.safetensors fabrics --photos FOLDER
 
     Parameters
     ----------
@@ -45,10 +49,12 @@ def run(
         tell fabrics apart (needs the fit extra). raster, path: how well that stage recovers random fabrics of each
         weave from 20 % off (slow: a fit for each; needs the fit extra). ablation: what the raster stage finds without
         parts of its shading, its losses and its prior, as in figures 15, 17 and 18 of Li et al. 2024 (ten fits; needs
-        the fit extra).
+        the fit extra). network: the network's guess, alone and with the analysis, on pictures that it has not learned
+        from (needs the fit extra).
     folder:
         Of photos, fits and losses: holds the photos. For photos also SOURCES.csv with the columns file, weave and notes
-        ("about N yarns across horizontally and M vertically"); for losses two or more PNG files.
+        ("about N yarns across horizontally and M vertically"); for losses two or more PNG files. Of network: its
+        weights, or "shipped".
     features:
         Of losses: the feature network, vgg16 or a safetensors file of another VGG.
     fast:
@@ -66,9 +72,20 @@ def run(
         folder for each photo's asset, picture (photo, then each stage) and numbers.
     stages:
         Of fits: as of ``usdfab fit``.
+    dataset:
+        Of network: a folder of ``usdfab dataset fabrics``, whose test part is judged. May be left out with --photos.
+    photos:
+        Of network: also judge a folder of labelled photos.
+    analysis:
+        Of network: also analyse each picture of the data set (slow).
     """
     if output is not None and what not in ("ablation", "fits"):
         raise UsdfabError(f"evaluate {what} writes no files", place="--output", remedy="leave it out")
+    if what == "network":
+        _network(folder, dataset, photos, analysis, json)
+        return
+    if dataset is not None or photos is not None:
+        raise UsdfabError(f"evaluate {what} takes no data set", place=str(dataset or photos), remedy="leave it out")
     if what in ("raster", "ablation", "path"):
         if folder is not None:
             raise UsdfabError(
@@ -107,6 +124,39 @@ def _fits(folder: Path, output: Path | None, stages: str, quality: str, seed: in
         print_json({"fits": [asdict(row) for row in rows]})
     else:
         print(format_fits(rows))
+
+
+def _network(weights: Path | None, dataset: Path | None, photos: Path | None, analysis: bool, json: bool) -> None:
+    from usdfab.fit.extra import require_fit_extra
+
+    require_fit_extra("evaluate network")
+    if weights is None or (dataset is None and photos is None):
+        raise UsdfabError(
+            "evaluate network needs weights, and a data set or --photos",
+            remedy="usdfab evaluate network WEIGHTS DATASET --photos FOLDER",
+        )
+    from usdfab.fit.network.evaluation import evaluate_network
+    from usdfab.fit.network.network_file import load_network
+    from usdfab.fit.network.photo_evaluation import evaluate_network_photos, format_photos, photo_json
+    from usdfab.fit.network.tables import format_report, summary
+
+    network = load_network(None if str(weights) == "shipped" else weights)
+    said: dict = {}
+    texts = []
+    if dataset is not None:
+        with progress_bar("Network") as update:
+            report = evaluate_network(network, dataset, analysis=analysis, progress=update)
+        said["report"] = summary(report)
+        texts.append(format_report(report))
+    if photos is not None:
+        with progress_bar("Photos") as update:
+            judged = evaluate_network_photos(network, photos, progress=update)
+        said["photos"] = photo_json(judged)
+        texts.append(format_photos(judged))
+    if json:
+        print_json(said)
+    else:
+        print("\n\n".join(texts))
 
 
 def _path(count: int, seed: int, quality: Literal["draft", "standard", "paper"], json: bool) -> None:

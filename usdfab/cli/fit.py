@@ -40,7 +40,9 @@ def run(
     ] = None,
     stages: Annotated[
         str,
-        Parameter(help="Comma-separated: analysis, raster, match, path (all but analysis: slow, need the fit extra)."),
+        Parameter(
+            help="Comma-separated: analysis, network, raster, match, path (the last three are slow; all but the first need the fit extra)."
+        ),
     ] = "analysis",
     quality: Annotated[
         Literal["draft", "standard", "paper"],
@@ -63,12 +65,13 @@ def run(
     """Estimate a fabric from one photo of woven cloth, seen straight from above.
 
     The analysis stage reads counts, weave, colours, widths and twist from the photo; fiber parameters it cannot see
-    are priors, and what is uncertain is said. The raster stage then moves shape and appearance until a rasterized
-    picture resembles the photo, the match stage shape, appearance and exposure until a path-traced one does, the path
-    stage colours and roughnesses by gradients of the path tracer; each is used only where it comes closer. Ctrl-C ends
-    them early with the best so far. What is finished is kept beside OUTPUT until the fit is done; after a break
-    --resume goes on from there, to the same result. A photo that shows no woven fabric ends with exit code 3 and what
-    was measured; nothing is written then, unless --force is given.
+    are priors, and what is uncertain is said. The network stage weighs counts, weave and widths with its own guess.
+    The raster stage then moves shape and appearance until a rasterized picture resembles the photo, the match stage
+    shape, appearance and exposure until a path-traced one does, the path stage colours and roughnesses by gradients of
+    the path tracer; each of these three is slow, and is used only where it comes closer. Ctrl-C ends them early with
+    the best so far. What is finished is kept beside OUTPUT until the fit is done; after a break --resume goes on from
+    there, to the same result. A photo that shows no woven fabric ends with exit code 3 and what was measured; nothing
+    is written then, unless --force is given.
 
     Usage examples:
 

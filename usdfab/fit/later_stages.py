@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 from numpy.typing import NDArray
 
 from usdfab.fabric import FabricParameters
+from usdfab.fit.analysis import PhotoAnalysis
 from usdfab.fit.course import Course
-from usdfab.fit.fit_checkpoint import CheckpointFiles, FitCheckpoint
+from usdfab.fit.fit_checkpoint import STATE_SUFFIXES, CheckpointFiles, FitCheckpoint
 from usdfab.fit.stages import StageOutcome, run_raster
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ SECONDS_PER_MILLION_PATHS, SECONDS_PER_STEP = 10.0, 2.0
 
 SECONDS_PER_MATCH_SAMPLE = 1.2e-5
 """Of the match stage, about, features included."""
+
+NETWORK_SECONDS = 5.0
 
 JUDGING_SECONDS = 15.0
 """What it takes, about, to find albedos and to judge a stage."""
@@ -80,6 +83,8 @@ class LaterStages:
             if name == "raster" and self.raster is not None:
                 samples = (self.raster.width * self.raster.supersampling) ** 2
                 work = self.raster.iterations * (SECONDS_PER_ITERATION + SECONDS_PER_SAMPLE * samples)
+            elif name == "network":
+                work = NETWORK_SECONDS
             elif name == "match" and self.match is not None:
                 work = SECONDS_PER_MATCH_SAMPLE * self.match.pictures * self.match.width**2 * self.match.spp
             elif self.path is not None:
@@ -92,7 +97,7 @@ class LaterStages:
         first: StageOutcome,
         shown: FabricParameters,
         photo: NDArray,
-        rotation: float,
+        analysis: PhotoAnalysis,
         kept: FitCheckpoint,
         course: Course,
     ) -> tuple[StageOutcome, ...]:
@@ -102,8 +107,8 @@ class LaterStages:
         ----------
         shown:
             The analysis' fabric with the colours that the photo shows as albedo.
-        photo, rotation:
-            (H, W, 3) linear; turn of the cloth in it, radians.
+        photo, analysis:
+            (H, W, 3) linear, and what it shows.
         """
         outcomes, ran = [first], False
         for name in self.names:
@@ -111,12 +116,12 @@ class LaterStages:
             job = self._job(name, last)
             done = kept.finished(len(outcomes), name, job)
             if done is None:
-                if ran and self.files is not None:
+                if ran and self.files is not None and name in STATE_SUFFIXES:
                     # Only the first stage that is not finished can have been left unfinished from the same start.
                     self.files.of(name).unlink(missing_ok=True)
                 ran = True
                 try:
-                    before, done = self._run(name, last, shown, photo, rotation, course)
+                    before, done = self._run(name, last, shown, photo, analysis, course)
                 except KeyboardInterrupt:
                     # Outside the iterations, which end by themselves.
                     before, done = last.distance, _interrupted(name, last)
@@ -138,9 +143,23 @@ class LaterStages:
         return fingerprint(last.fabric, last.halfway, last.exposure, self.raster, own)
 
     def _run(
-        self, name: str, last: StageOutcome, shown: FabricParameters, photo: NDArray, rotation: float, course: Course
+        self,
+        name: str,
+        last: StageOutcome,
+        shown: FabricParameters,
+        photo: NDArray,
+        analysis: PhotoAnalysis,
+        course: Course,
     ) -> tuple[float | None, StageOutcome]:
         assert self.raster is not None and self.path is not None
+        rotation = analysis.rotation
+        if name == "network":
+            from usdfab.fit.network.stage import run_network
+
+            guess, _ = run_network(
+                analysis, shown, photo, seed=self.seed, albedo_paths=self.albedo_paths, progress=course.stage(name)
+            )
+            return last.distance, replace(guess, exposure=last.exposure)
         if name == "raster":
             before, after = run_raster(
                 last.fabric, shown, photo, rotation, self.raster, seed=self.seed, exposure=last.exposure,

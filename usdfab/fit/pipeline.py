@@ -127,7 +127,7 @@ def fit_photo(
         warnings.insert(
             0, f"nothing says how large the photo is: its width is taken as {DEFAULT_WIDTH * 1e3:g} mm; use --size"
         )
-    outcomes = later.run(first, shown, photo.pixels, analysis.rotation, kept, course)
+    outcomes = later.run(first, shown, photo.pixels, analysis, kept, course)
     exposure = outcomes[-1].exposure
     warnings += dict.fromkeys(note for outcome in outcomes for note in outcome.notes)
     light = f"the photo is {exposure:.2f} times as bright as under the rig's standard light"

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from usdfab.fit.features import FeatureNet
     from usdfab.fit.raster_stage import StageSettings
 
-STAGES = ("analysis", "raster", "match", "path")
+STAGES = ("analysis", "network", "raster", "match", "path")
 """In the order in which they run."""
 
 JUDGE_PATHS_PER_PIXEL = 16
