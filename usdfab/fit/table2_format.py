@@ -53,8 +53,8 @@ def format_table2(rows: Sequence[Table2Row]) -> str:
         lines += [*_stage_table(rows, stage), ""]
     lines += [f"{row.name} was refused: {row.problem}" for row in rows if row.problem]
     lines += ["", "Li et al. 2024, Table 2: error in % of the range, after all stages, other fabrics"]
-    lines.append(_line("", [*PAPER_FABRICS, "mean"]))
-    lines.append(_line("weave", ["right"] * len(PAPER_FABRICS)))
+    lines.append(_line("", [f"{name} " for name in (*PAPER_FABRICS, "mean")]))
+    lines.append(_line("weave", ["right "] * len(PAPER_FABRICS)))
     for name, symbol in SYMBOLS.items():
         lines.append(_line(symbol, [f"{value:.2f} " for value in (*PAPER_ERRORS[name], PAPER_MEANS[name])]))
     return "\n".join(lines).replace("\n\n\n", "\n\n")
@@ -64,7 +64,7 @@ def _stage_table(rows: Sequence[Table2Row], stage: str) -> list[str]:
     means = mean_errors(rows, stage)
     lines = [
         f"after {stage}: error in % of the range ({PRIOR} estimated by no stage so far: the prior's error)",
-        _line("", [row.name for row in rows] + ["mean", "paper"]),
+        _line("", [f"{name} " for name in (*(row.name for row in rows), "mean", "paper")]),
         _line("weave", [_weave(row, stage) for row in rows]),
     ]
     for name, symbol in SYMBOLS.items():
@@ -83,7 +83,7 @@ def _stage_table(rows: Sequence[Table2Row], stage: str) -> list[str]:
 
 
 def _line(first: str, cells: Sequence[str]) -> str:
-    return f"{first:<{FIRST}}" + "".join(f"{cell:>{CELL}}" for cell in cells)
+    return (f"{first:<{FIRST}}" + "".join(f"{cell:>{CELL}}" for cell in cells)).rstrip()
 
 
 def _cell(percent: float, prior: bool) -> str:
