@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,22 @@ def test_each_photo_gets_an_asset_a_picture_and_a_row_and_is_fitted_once(fits: l
     table = format_fits(rows)
     assert f"within {SAME_CLOTH} of the photo: {int((good.last or 9.0) <= SAME_CLOTH)} of 2" in table
     assert "refused" in table
+
+
+def test_an_interrupted_fit_is_no_result(fits: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    photos, results = tmp_path / "photos", tmp_path / "results"
+    whole = fit_evaluation.fit_photo
+
+    def broken_off(*arguments: object, **options: object) -> Fit:
+        fit = whole(*arguments, **options)  # type: ignore[arg-type]
+        return replace(fit, stages=(*fit.stages[:-1], replace(fit.stages[-1], interrupted=True)))
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(fit_evaluation, "fit_photo", broken_off)
+        evaluate_fits(photos, results, names=("a.png",))
+    assert not (results / "a.json").exists()
+    assert evaluate_fits(photos, results, names=("a.png",))[0].distances
+    assert fits == ["a", "a"]
 
 
 def test_wrong_folders_are_one_line(fits: list[str], tmp_path: Path) -> None:

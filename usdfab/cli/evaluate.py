@@ -10,14 +10,14 @@ from usdfab.errors import UsdfabError
 
 
 def run(
-    what: Literal["photos", "fits", "losses", "raster", "ablation", "path", "network"],
+    what: Literal["photos", "fits", "losses", "raster", "ablation", "path", "network", "table2"],
     folder: Path | None = None,
     dataset: Path | None = None,
     /,
     *,
     features: str = "vgg16",
     fast: bool = False,
-    count: int = 1,
+    count: int | None = None,
     seed: Seed = 0,
     quality: Literal["draft", "standard", "paper"] = "draft",
     ablation: bool = False,
@@ -40,6 +40,7 @@ def run(
         usdfab evaluate ablation --fibers 40 -o ablation
         usdfab evaluate path --count 3 --seed 1
         usdfab evaluate network weights.safetensors fabrics --photos FOLDER
+        usdfab evaluate table2 -o table2 --stages analysis,match --quality draft
 
     Parameters
     ----------
@@ -50,7 +51,8 @@ def run(
         weave from 20 % off (slow: a fit for each; needs the fit extra). ablation: what the raster stage finds without
         parts of its shading, its losses and its prior, as in figures 15, 17 and 18 of Li et al. 2024 (ten fits; needs
         the fit extra). network: the network's guess, alone and with the analysis, on pictures that it has not learned
-        from (needs the fit extra).
+        from (needs the fit extra). table2: random fabrics fitted from nothing but their picture, errors in the layout
+        of Table 2 of Li et al. 2024; the same command goes on with a run that was broken off (needs the fit extra).
     folder:
         Of photos, fits and losses: holds the photos. For photos also SOURCES.csv with the columns file, weave and notes
         ("about N yarns across horizontally and M vertically"); for losses two or more PNG files. Of network: its
@@ -60,18 +62,21 @@ def run(
     fast:
         Of losses: compute as the fit does, in bfloat16 where the processor has it.
     count:
-        Of raster and ablation: fabrics of each weave; of path: how many fabrics, plain, twill and satin in turn.
+        Of raster and ablation (1 by default) and of table2 (3): fabrics of each weave; of path (1): how many fabrics,
+        plain, twill and satin in turn.
     quality:
-        Of fits, raster, ablation and path: resolution, samples and iterations, as of ``usdfab fit``.
+        Of fits, raster, ablation, path and table2: resolution, samples and iterations, as of ``usdfab fit``; of table2
+        also of the picture that is fitted: 240 pixels at 64 samples, denoised; 480 at 256; 720 at 1024.
     ablation:
         Of raster: each fabric also without parts of the shading and of the losses (six fits for each).
     fibers:
         Of raster and ablation: fibers in a yarn, instead of about 200, to save time.
     output:
         Of ablation: a folder for its pictures (the target, then each way, side by side) and ablation.json. Of fits: a
-        folder for each photo's asset, picture (photo, then each stage) and numbers.
+        folder for each photo's asset, picture (photo, then each stage) and numbers. Of table2: such a folder too, with
+        each true fabric and its photo.
     stages:
-        Of fits: as of ``usdfab fit``.
+        Of fits and table2: as of ``usdfab fit``.
     dataset:
         Of network: a folder of ``usdfab dataset fabrics``, whose test part is judged. May be left out with --photos.
     photos:
@@ -79,18 +84,22 @@ def run(
     analysis:
         Of network: also analyse each picture of the data set (slow).
     """
-    if output is not None and what not in ("ablation", "fits"):
+    if output is not None and what not in ("ablation", "fits", "table2"):
         raise UsdfabError(f"evaluate {what} writes no files", place="--output", remedy="leave it out")
     if what == "network":
         _network(folder, dataset, photos, analysis, json)
         return
     if dataset is not None or photos is not None:
         raise UsdfabError(f"evaluate {what} takes no data set", place=str(dataset or photos), remedy="leave it out")
-    if what in ("raster", "ablation", "path"):
+    if what in ("raster", "ablation", "path", "table2"):
         if folder is not None:
             raise UsdfabError(
                 f"evaluate {what} makes its own fabrics", place=str(folder), remedy="leave the folder out"
             )
+        if what == "table2":
+            _table2(3 if count is None else count, seed, quality, stages, output, json)
+            return
+        count = 1 if count is None else count
         if what == "raster":
             _raster(count, seed, quality, ablation, fibers, json)
         elif what == "ablation":
@@ -157,6 +166,27 @@ def _network(weights: Path | None, dataset: Path | None, photos: Path | None, an
         print_json(said)
     else:
         print("\n\n".join(texts))
+
+
+def _table2(count: int, seed: int, quality: str, stages: str, output: Path | None, json: bool) -> None:
+    from usdfab.fit.extra import require_fit_extra
+
+    require_fit_extra("evaluate table2")
+    from usdfab.fit.table2_evaluation import evaluate_table2
+    from usdfab.fit.table2_format import format_table2, summary
+
+    if output is None:
+        raise UsdfabError("evaluate table2 needs a folder to write to", remedy="usdfab evaluate table2 -o RESULTS")
+    names = [name.strip() for name in stages.split(",")]
+    with progress_bar("Table 2") as update:
+        rows = evaluate_table2(
+            output, stages=names, quality=quality, count=count, seed=seed,
+            progress=lambda text, done, total: update(done, total, text),
+        )  # fmt: skip
+    if json:
+        print_json(summary(rows))
+    else:
+        print(format_table2(rows))
 
 
 def _path(count: int, seed: int, quality: Literal["draft", "standard", "paper"], json: bool) -> None:

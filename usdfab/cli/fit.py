@@ -41,7 +41,7 @@ def run(
     stages: Annotated[
         str,
         Parameter(
-            help="Comma-separated: analysis, network, raster, match, path (the last three are slow; all but the first need the fit extra)."
+            help="Comma-separated: analysis, network, raster, match, path; all but the first need the fit extra."
         ),
     ] = "analysis",
     quality: Annotated[

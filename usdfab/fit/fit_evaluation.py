@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,9 +12,9 @@ from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
-from usdfab.files import whole_file
 from usdfab.fit.fit_checkpoint import CheckpointFiles
 from usdfab.fit.pipeline import Fit, fit_photo
+from usdfab.fit.result_folder import made_folder, no_result, read_result, write_result
 from usdfab.fit.straighten import straightened
 from usdfab.imaging import denoise, linear_to_srgb, side_by_side, srgb_to_linear, write_image
 from usdfab.tracer import RenderSettings, Tracer
@@ -123,10 +122,7 @@ def evaluate_fits(
     if not photos:
         raise UsdfabError("no photos are there", place=str(source), remedy=f"name a folder of {', '.join(SUFFIXES)}")
     about = {"stages": list(stages), "quality": quality, "width": width, "seed": seed}
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsdfabError(f"cannot make the folder ({error.strerror})", place=str(target)) from error
+    made_folder(target)
     net = load_features()
     rows = []
     for k, photo in enumerate(photos):
@@ -136,8 +132,7 @@ def evaluate_fits(
         row = _read_row(record, about)
         if row is None:
             row = _fitted(photo, target, net, stages, quality, width, seed)
-            with whole_file(record) as temporary:
-                temporary.write_text(json.dumps({"about": about} | asdict(row)), encoding="utf-8")
+            write_result(record, about, asdict(row))
         rows.append(row)
     return rows
 
@@ -168,8 +163,11 @@ def _fitted(
         fit = fit_photo(photo, width, None, seed, stages=stages, quality=quality, checkpoint=files, resume=True)
     except UsdfabError as error:
         return FitRow(photo.stem, {}, 1.0, 0.0, str(error))
+    # Ctrl-C within a stage gives what was found so far. Its checkpoint stays, and the same command goes on from there.
+    if fit.stages[-1].interrupted:
+        raise KeyboardInterrupt
     write_fabric(fit.fabric, asset, overwrite=True)
-    goal = _middle(fit)
+    goal = photo_middle(fit)
     pictures = {stage.name: stage.exposure * swatch(stage.fabric, seed) for stage in fit.stages}
     write_image(folder / f"{photo.stem}.png", side_by_side([goal, *pictures.values()]), overwrite=True)
     distances = {name: gram_distance(goal, picture, net) for name, picture in pictures.items()}
@@ -177,7 +175,7 @@ def _fitted(
     return FitRow(photo.stem, distances, fit.exposure, sum(stage.seconds for stage in fit.stages))
 
 
-def _middle(fit: Fit) -> NDArray[np.float32]:
+def photo_middle(fit: Fit) -> NDArray[np.float32]:
     """The middle square of the photo, as large in pixels as the picture of that much cloth."""
     height, width = fit.photo.shape[:2]
     side = min(height, width)
@@ -195,14 +193,8 @@ def swatch(fabric: FabricParameters, seed: int = 0) -> NDArray[np.float32]:
 
 
 def _read_row(record: Path, about: dict[str, Any]) -> FitRow | None:
-    if not record.exists():
-        return None
+    data = read_result(record, about)
     try:
-        data = json.loads(record.read_text(encoding="utf-8"))
-        if data.pop("about") != about:
-            raise UsdfabError(
-                "this result is of other options", place=str(record), remedy="choose another folder for the output"
-            )
-        return FitRow(**data)
-    except (OSError, KeyError, TypeError, json.JSONDecodeError) as error:
-        raise UsdfabError("this is no result of a fit", place=str(record), remedy="remove the file") from error
+        return None if data is None else FitRow(**data)
+    except TypeError as error:
+        raise no_result(record) from error

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
-from usdfab.fabric import SYSTEMS, FabricParameters
-from usdfab.fabric.optics import ROUGHNESSES, optics_of, with_optics
-from usdfab.fabric.parameters import PARAMETER_BY_NAME
+from usdfab.fabric import FabricParameters
+from usdfab.fabric.optics import optics_of, with_optics
 from usdfab.fabric.sampling import sample_fabric
 from usdfab.fit.path_noise import Denoised
 from usdfab.fit.path_result import PathResult
 from usdfab.fit.path_settings import PathSettings
 from usdfab.fit.path_space import OpticsSpace
 from usdfab.fit.path_stage import Progress, denoiser_installed, refine_appearance
+from usdfab.fit.table2 import PAPER_MEANS, SYMBOLS, range_errors
 from usdfab.imaging.denoise import denoise
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import swatch_scene
@@ -35,11 +35,13 @@ WEAVES = ("plain", "twill0", "satin")
 PERTURBATION = 0.2
 """Relative error of each parameter at the start."""
 
-PAPER = {"C": 5.43, "gamma_M": 6.01, "gamma_M0": 9.64, "gamma_N": 12.88}
-"""Mean errors of Table 2 of Li et al. 2024 in percent of the parameter's range."""
+GROUPS = {
+    name: SYMBOLS[name] for name in ("albedo", "roughness_longitudinal", "roughness_primary", "roughness_azimuthal")
+}
+"""What the stage estimates, by the names of ``YarnParameters``."""
 
-GROUPS = {"albedo": "C", "roughness_longitudinal": "gamma_M", "roughness_primary": "gamma_M0",
-          "roughness_azimuthal": "gamma_N"}  # fmt: skip
+PAPER = {symbol: PAPER_MEANS[name] for name, symbol in GROUPS.items()}
+"""Mean errors of Table 2 of Li et al. 2024 in percent of the parameter's range."""
 
 PHOTO_SAMPLES = {"draft": 128, "standard": 512, "paper": 4096}
 """Per pixel of the picture that stands for the photo; it is denoised where the denoiser is installed."""
@@ -139,21 +141,8 @@ def perturbed(fabric: FabricParameters, seed: int) -> FabricParameters:
 
 def table2_errors(fabric: FabricParameters, truth: FabricParameters, weave: str) -> dict[str, float]:
     """Percent of each parameter's range in Table 4, means over systems, colours and channels (Table 2)."""
-    column = weave.removesuffix("_rot90")
-    found, right = optics_of(fabric), optics_of(truth)
-    errors: dict[str, list[float]] = {key: [] for key in PAPER}
-    errors["C"] = (abs(found.albedo - right.albedo) / _width("albedo", column, 0)).ravel().tolist()
-    for index, _ in enumerate(SYSTEMS):
-        for k, name in enumerate(ROUGHNESSES):
-            off = abs(found.roughness[index, k] - right.roughness[index, k])
-            errors[GROUPS[name]].append(float(off) / _width(name, column, index))
-    return {key: 100.0 * float(np.mean(values)) for key, values in errors.items()}
-
-
-def _width(name: str, column: str, system: int) -> float:
-    paper = PARAMETER_BY_NAME[name].paper
-    assert paper is not None
-    return paper[column][1 - system].width()  # the table has the weft first
+    found = range_errors(fabric, truth, weave, tuple(GROUPS))
+    return {symbol: 100.0 * found[name] for name, symbol in GROUPS.items()}
 
 
 def format_recoveries(results: Sequence[Recovery]) -> str:

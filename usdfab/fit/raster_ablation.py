@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from usdfab.errors import UsdfabError
 from usdfab.files import whole_file
 from usdfab.fit.features import FeatureNet, fast_dtype, load_features
-from usdfab.fit.raster_evaluation import JUDGED, SYMBOLS, Recovery, evaluate_raster
+from usdfab.fit.raster_evaluation import JUDGED, Recovery, evaluate_raster
 from usdfab.fit.raster_stage import StageResult, StageSettings
+from usdfab.fit.table2 import SYMBOLS
 from usdfab.fit.texture import Target, color_loss, texture_loss
 from usdfab.imaging import side_by_side, write_image
 

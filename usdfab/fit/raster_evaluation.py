@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from usdfab.errors import UsdfabError
 from usdfab.fabric import SYSTEMS, FabricParameters
 from usdfab.fabric.optics import ROUGHNESSES
-from usdfab.fabric.parameters import PARAMETER_BY_NAME
 from usdfab.fabric.sampling import sample_fabric
 from usdfab.fit.features import FeatureNet
 from usdfab.fit.path_stage import start_from_joint
 from usdfab.fit.raster.unconstrained import soft_range
 from usdfab.fit.raster_stage import StageResult, StageSettings, refine_by_raster, render_size
+from usdfab.fit.table2 import PAPER_MEANS, SYMBOLS, range_errors, range_width
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import swatch_scene
 
@@ -33,31 +33,6 @@ TARGET_SPP = 64
 
 JUDGED = ("albedo", *ROUGHNESSES, "twist", "crimp", "inclination", "radius", "irregularity")
 """Rows of Table 2 that stage 2 moves."""
-
-SYMBOLS = {
-    "albedo": "C",
-    "roughness_longitudinal": "gamma_M",
-    "roughness_azimuthal": "gamma_N",
-    "roughness_primary": "gamma_M0",
-    "twist": "alpha",
-    "crimp": "beta",
-    "inclination": "u_max",
-    "radius": "e_yarn",
-    "irregularity": "Q",
-}
-
-PAPER_MEANS = {
-    "albedo": 5.43,
-    "roughness_longitudinal": 6.01,
-    "roughness_primary": 9.64,
-    "roughness_azimuthal": 12.88,
-    "twist": 7.94,
-    "crimp": 2.29,
-    "inclination": 11.49,
-    "radius": 1.69,
-    "irregularity": 0.19,
-}
-"""Percent, over the paper's nine fabrics after all three of its stages (Table 2)."""
 
 ABLATIONS: dict[str, dict[str, object]] = {
     "full": {},
@@ -162,14 +137,6 @@ def evaluate_raster(
     return results
 
 
-def range_width(name: str, weave: str, system: str) -> float:
-    """Width of a parameter's range: Table 4's in the weave (6 sigma for a normal distribution), else the soft range."""
-    parameter = PARAMETER_BY_NAME[name]
-    if parameter.paper is None:
-        return parameter.soft[1] - parameter.soft[0]
-    return parameter.paper[weave][0 if system == "weft" else 1].width()
-
-
 def perturbed(truth: FabricParameters, weave: str, rng: np.random.Generator) -> FabricParameters:
     """``truth`` with every number of ``JUDGED`` moved by ``PERTURBATION`` of its range, and another seed.
 
@@ -201,15 +168,7 @@ def _moved(value: float, step: float, limits: tuple[float, float], rng: np.rando
 
 def errors(fabric: FabricParameters, truth: FabricParameters, weave: str) -> dict[str, float]:
     """|estimate - truth| over the width of the range, by name."""
-    result = {}
-    for name in JUDGED:
-        parts = []
-        for system in SYSTEMS:
-            width = range_width(name, weave, system) * (truth.size[0] if name == "radius" else 1.0)
-            pair = [np.atleast_1d(getattr(f.system(system), name)) for f in (fabric, truth)]
-            parts.append(float(np.abs(pair[0] - pair[1]).mean()) / width)
-        result[name] = float(np.mean(parts))
-    return result
+    return range_errors(fabric, truth, weave, JUDGED)
 
 
 def _target(truth: FabricParameters, width: int, seed: int) -> np.ndarray:
