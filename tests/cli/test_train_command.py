@@ -28,23 +28,25 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def small(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small feature network instead of VGG, which is tested by itself."""
-    from usdfab.fit.network import evaluation, inputs, photo_evaluation
+    from usdfab.fit.network import evaluation, inputs, photo_evaluation, store
 
     network = net(tmp_path_factory.mktemp("net"))
     for module in (inputs, evaluation, photo_evaluation):
         monkeypatch.setattr(module, "feature_net", lambda *_: network)
+    monkeypatch.setattr(store, "DRAWN_CHUNK", 2)
 
 
 @pytest.fixture(scope="module")
 def made(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights of a few epochs, with their inputs and curves beside them."""
     from usdfab.cli.main import _run
-    from usdfab.fit.network import inputs
+    from usdfab.fit.network import inputs, store
 
     folder = tmp_path_factory.mktemp("made")
     network = net(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(inputs, "feature_net", lambda *_: network)
+        patch.setattr(store, "DRAWN_CHUNK", 2)
         options = [
             "--epochs",
             "2",
@@ -72,7 +74,7 @@ def test_what_is_written(made: Path, dataset: Path, run: Run) -> None:
     assert (code, err) == (0, "")
     about = json.loads(out)["about"]
     assert about["model"] == "robust" and about["data"]["training_samples"] == 8 and about["data"]["samples"] == 12
-    assert about["data"]["drawn"] == 50
+    assert about["data"]["drawn"] == 2
     assert about["data"]["size"] == 64 and about["data"]["spp"] == 1 and set(about["skill"]) >= {"count", "crimp"}
 
 
@@ -152,7 +154,7 @@ def test_bad_input(made: Path, dataset: Path, run: Run, tmp_path: Path, monkeypa
     one_line(train("--curves", made), "something in the way")
     one_line(run("train", "fit-network", dataset, "-o", new, "--epochs", 0), "0 epochs are none")
     one_line(run("train", "fit-network", dataset, "-o", new, "--views", 0), "0 views are none")
-    one_line(train("--drawn", -1), "-1 drawn cloths cannot be")
+    one_line(run("train", "fit-network", dataset, "-o", new, "--drawn", -1, "--views", 1), "-1 drawn cloths cannot be")
     one_line(run("evaluate", "network", made / "w.safetensors"), "a data set or --photos")
     one_line(run("evaluate", "network", made / "none.safetensors", dataset), "no such file")
     one_line(run("evaluate", "raster", "--photos", tmp_path), "takes no data set")

@@ -16,7 +16,8 @@ from usdfab.fabric.sampling_wide import sample_class, sample_wide
 from usdfab.fabric.weave import NAMED_WEAVES, PAPER_WEAVES, twill
 from usdfab.fit.network.labels import FAMILIES, LABELS, family_of, typical_weave, weave_label
 from usdfab.fit.network.targets import INDEX, NAMES, TARGETS, decode, encode
-from usdfab.fit.network.turns import TURNS, Turn, Unevenness, cropped, recolored, sample_unevenness, uneven
+from usdfab.fit.network.turns import TURNS, Turn, cropped, recolored
+from usdfab.fit.network.unevenness import Unevenness, sample_unevenness, uneven
 from usdfab.fit.network.views import view
 
 

@@ -15,7 +15,8 @@ from torch import Tensor, nn
 
 from usdfab.errors import UsdfabError
 from usdfab.files import whole_file
-from usdfab.fit.network.store import Drawn, Rows, refused
+from usdfab.fit.network.disk import refused
+from usdfab.fit.network.store import Drawn, Rows
 
 if TYPE_CHECKING:
     from usdfab.fit.network.training import TrainSettings

@@ -15,12 +15,12 @@ from safetensors.torch import save_file
 from usdfab.errors import UsdfabError
 from usdfab.fabric.weave import PAPER_WEAVES
 from usdfab.files import whole_file
+from usdfab.fit.network.disk import refused
 from usdfab.fit.network.inputs import LEVELS, REVISION, SIZE, Basis
 from usdfab.fit.network.labels import LABELS
 from usdfab.fit.network.model import Paper, Robust
 from usdfab.fit.network.paper import NUMBERS
 from usdfab.fit.network.spectra import BINS, LATTICE_SHAPE
-from usdfab.fit.network.store import refused
 from usdfab.fit.network.targets import targets_hash
 
 FORMAT = "usdfab-network/1"

@@ -6,7 +6,6 @@ other inputs is refused, not used.
 
 from __future__ import annotations
 
-import errno
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,6 +26,7 @@ from usdfab.fit.dataset.reader import Stored, read_dataset
 from usdfab.fit.dataset.settings import Settings, settings_of
 from usdfab.fit.dataset.store import MANIFEST, read_manifest
 from usdfab.fit.features import FeatureNet
+from usdfab.fit.network.disk import refused
 from usdfab.fit.network.drawn import REVISION as DRAWN_REVISION, drawn_cloth
 from usdfab.fit.network.inputs import LEVELS, REVISION as INPUT_REVISION, Basis, fitted_basis, prepared, texture_vectors
 from usdfab.fit.network.labels import LABELS, weave_label
@@ -316,14 +316,3 @@ def _write(path: Path, arrays: dict[str, Any], about: dict[str, str]) -> None:
             save_file({name: np.ascontiguousarray(a) for name, a in arrays.items()}, temporary, about)
     except (OSError, SafetensorError) as error:
         raise refused(error, path) from error
-
-
-def refused(error: Exception, path: Path) -> UsdfabError:
-    """The error to raise where a disk refuses to take a file."""
-    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-    if full or "No space left" in str(error):
-        return UsdfabError(
-            "the disk is full", place=str(path), remedy="make room and run the same command again; nothing is lost"
-        )
-    reason = (error.strerror or "no reason given") if isinstance(error, OSError) else str(error)
-    return UsdfabError(f"cannot be written ({reason})", place=str(path))

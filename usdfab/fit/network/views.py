@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from usdfab.fabric import FabricParameters
 from usdfab.fit.dataset.augment import Camera, photographed, sample_camera
 from usdfab.fit.network.inputs import prepared
-from usdfab.fit.network.turns import TURNS, cropped, recolored, sample_unevenness, uneven
+from usdfab.fit.network.turns import TURNS, cropped, recolored
+from usdfab.fit.network.unevenness import sample_unevenness, uneven
 from usdfab.srgb import srgb_to_linear
 
 REVISION = 1
