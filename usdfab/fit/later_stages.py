@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from usdfab.fit.path_settings import PathSettings
     from usdfab.fit.raster_stage import StageSettings
 
-SECONDS_PER_SAMPLE, SECONDS_PER_ITERATION = 1e-4, 1.0
+SECONDS_PER_SAMPLE, SECONDS_PER_ITERATION = 2e-4, 4.0
 """Of the raster stage, about."""
 
 SECONDS_PER_MILLION_PATHS, SECONDS_PER_STEP = 10.0, 2.0
