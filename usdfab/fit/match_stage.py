@@ -50,7 +50,7 @@ PLIES = (1, 2)
 LIGHTS = (0.75, 1.0, 1.33, 1.75)
 """Exposures, times the start's, with which each of these is seen."""
 
-VARIED_CELLS = 64
+VARIED_CELLS = 16
 """Crossings of all variants of the repeat together beyond which pictures show fewer variants."""
 
 SPREAD_OF_FIT = 0.3
