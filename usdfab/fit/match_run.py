@@ -77,7 +77,7 @@ def run_match(
     )  # fmt: skip
     notes = []
     if result.interrupted:
-        notes.append(f"the match stage was interrupted after {len(result.losses) - 1} steps")
+        notes.append(f"the match stage was interrupted after {max(0, len(result.losses) - 1)} steps")
     say("judging the match stage", steps - 1, steps)
     # Other draws than those that were matched.
     after = stages.traced_distance(result.fabric, judged, judge, net, settings.seed + 1, result.exposure)
