@@ -187,33 +187,6 @@ def test_a_broken_off_match_goes_on_to_the_same_result(
         match_photo(wrong(), goal, SMALL, net=net, exposure=1.2, checkpoint=state)
 
 
-def test_first_looks_are_rounder_then_thinner_and_plied() -> None:
-    flat = replace(CLOTH, warp=replace(CLOTH.warp, flattening=1.25, twist=0.2), weft=replace(CLOTH.weft, ply_count=3))
-    assert match_stage.first_look(flat, 1.0, 1) == flat
-    narrow = match_stage.first_look(flat, 0.72, 2)
-    assert narrow.warp.flattening == 1.0
-    assert narrow.warp.radius == pytest.approx(0.72 * 1.25 * flat.warp.radius)
-    assert narrow.weft.radius == pytest.approx(0.72 * flat.weft.radius)
-    for system in ("warp", "weft"):
-        assert narrow.cover(system) == pytest.approx(0.72 * flat.cover(system))  # type: ignore[arg-type]
-    assert (narrow.warp.ply_count, narrow.warp.ply_twist) == (2, -0.2)
-    assert narrow.weft.ply_count == 3
-
-
-def test_separate_yarns_are_found_from_touching_ones(net: FeatureNet, tmp_path: Path) -> None:
-    """The truth has yarns 0.72 as wide, far beyond what one step sees, and is seen under other light."""
-    settings = replace(SMALL, free=("radius", "flattening"), iterations=0)
-    truth = match_stage.first_look(CLOTH, 0.72, 1)
-    scene = swatch_scene(truth)
-    render = Tracer(scene).render(scene.cameras[0], RenderSettings((32, 32), spp=64, seed=9))
-    goal = 1.33 * denoise(render.pixels, render.albedo, render.normal)
-    result = match_photo(CLOTH, goal, settings, net=net)
-    assert result.fabric.warp.radius == pytest.approx(truth.warp.radius)
-    assert result.fabric.warp.ply_count == 1
-    assert result.exposure == pytest.approx(1.33)
-    assert result.losses[1] < 0.5 * result.losses[0]
-
-
 def test_ctrl_c_keeps_the_best_so_far(
     net: FeatureNet, goal: np.ndarray, monkeypatch: pytest.MonkeyPatch, matched: MatchResult
 ) -> None:

@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pxr import Usd, UsdGeom
+from hypothesis import given, strategies as st
+from pxr import Usd, UsdGeom, UsdLux
 
 from usdfab.errors import UsdfabError
 from usdfab.usd.check import check
+from usdfab.usd.read_rig import read_rig
 from usdfab.usd.read_scene import read_scene
-from usdfab.usd.rig import PLANE_FACTOR, Rig, swatch_scene, write_rig
+from usdfab.usd.rig import PLANE_FACTOR, Rig, ring_rig, sample_scene, swatch_scene, write_rig
 
 SIZE = (5e-3, 3e-3)
 
@@ -103,6 +105,101 @@ def test_a_rig_in_other_units_and_axes(fabric, tmp_path):
     cloth = uv_at(scene.meshes[0], corners_in_view(scene)) * scene.fabrics[0].meters_per_uv
     np.testing.assert_allclose(cloth[2], SIZE, rtol=1e-5)
     np.testing.assert_allclose(scene.lights[0].intensity, swatch_scene(fabric).lights[0].intensity, rtol=1e-5)
+
+
+@given(elevation=st.floats(0.2, 1.5), lamps=st.integers(1, 12), azimuth=st.floats(-7, 7))
+def test_ring_lamps_together_are_as_bright_as_one(elevation, lamps, azimuth):
+    rig = ring_rig(SIZE, elevation, lamps, azimuth)
+    radiance = 0.0
+    for x, y, z in rig.light_positions:
+        distance = math.hypot(x, y, z)
+        assert math.asin(z / distance) == pytest.approx(elevation)
+        radiance += rig.light_intensity / lamps * z / distance**3 / math.pi
+    assert radiance == pytest.approx(1.0)
+    if lamps > 1:
+        np.testing.assert_allclose(np.sum(rig.light_positions, axis=0)[:2], 0, atol=1e-12)
+
+
+def test_a_ring_in_a_file_and_in_memory_agree(fabric, tmp_path):
+    rig = ring_rig(SIZE, 0.8, 5, 0.3)
+    fabric = replace(fabric, size=SIZE)
+    path = write_rig(tmp_path / "r.usda", SIZE, rig=rig)
+    assert check(path) == []
+    file, memory = swatch_scene(fabric, path), sample_scene(fabric, rig.with_sample((1e-3, 1e-3)))
+    assert len(file.lights) == len(memory.lights) == 5
+    for one, other in zip(file.lights, memory.lights, strict=True):
+        np.testing.assert_allclose(one.position, other.position, atol=1e-9)
+        np.testing.assert_allclose(one.intensity, other.intensity, rtol=1e-6)
+
+
+def test_a_rig_is_read_from_wherever_it_stands(fabric, tmp_path):
+    """Turned, moved, in millimetres and y up: the same rig in its own frame."""
+    own = ring_rig(SIZE, 0.8, 2, 0.3)
+    path = write_rig(tmp_path / "r.usda", SIZE, rig=own)
+    stage = Usd.Stage.CreateNew(str(tmp_path / "moved.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 0.001)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    root = UsdGeom.Xform.Define(stage, "/R")
+    root.GetPrim().GetReferences().AddReference(str(path))
+    root.AddTranslateOp().Set((30, -20, 70))
+    root.AddRotateXYZOp().Set((-90, 35, 20))
+    root.AddScaleOp().Set((1000, 1000, 1000))
+    stage.Save()
+    rig = read_rig(tmp_path / "moved.usda")
+    np.testing.assert_allclose(rig.sample_size, SIZE, rtol=1e-5)
+    assert rig.camera_height == pytest.approx(own.camera_height, rel=1e-5)
+    for light, position in zip(rig.lights, own.light_positions, strict=True):
+        np.testing.assert_allclose(light.position, position, atol=1e-8)
+    fabric = replace(fabric, size=SIZE)
+    seen, known = sample_scene(fabric, rig), sample_scene(fabric, own)
+    np.testing.assert_allclose(seen.cameras[0].tan_half, known.cameras[0].tan_half, rtol=1e-5)
+    np.testing.assert_allclose(seen.lights[1].intensity, known.lights[1].intensity, rtol=1e-5)
+    with pytest.raises(UsdfabError, match="cannot be written"):
+        write_rig(tmp_path / "again.usda", SIZE, rig=rig)
+
+
+def test_all_kinds_of_light_move_with_the_rig(tmp_path):
+    path = write_rig(tmp_path / "r.usda", SIZE)
+    stage = Usd.Stage.Open(str(path))
+    area = UsdLux.RectLight.Define(stage, "/Rig/Panel")
+    area.AddTranslateOp().Set((0.02, 0, 0.03))
+    UsdLux.DistantLight.Define(stage, "/Rig/Sun")
+    UsdLux.DomeLight.Define(stage, "/Rig/Sky")
+    camera = UsdGeom.Camera(stage.GetPrimAtPath("/Rig/Camera"))
+    camera.CreateExposureAttr(1.0)
+    stage.Save()
+    lights = {light.path: light for light in read_rig(path).lights}
+    plain = {light.path: light for light in read_scene(path).lights}
+    np.testing.assert_allclose(lights["/Rig/Panel"].corner, plain["/Rig/Panel"].corner, atol=1e-9)
+    np.testing.assert_allclose(lights["/Rig/Sun"].direction, (0, 0, -1), atol=1e-9)
+    for name, field in (("Panel", "radiance"), ("Sun", "irradiance"), ("Sky", "radiance"), ("Lamp", "intensity")):
+        doubled, one = (getattr(found[f"/Rig/{name}"], field) for found in (lights, plain))
+        np.testing.assert_allclose(doubled, 2.0 * np.asarray(one))
+
+
+def test_rigs_that_a_photo_cannot_have(tmp_path):
+    def changed(name, change):
+        path = write_rig(tmp_path / name, SIZE)
+        stage = Usd.Stage.Open(str(path))
+        change(stage)
+        stage.Save()
+        return path
+
+    def tilt(stage):
+        UsdGeom.Xformable(stage.GetPrimAtPath("/Rig/Camera")).AddRotateXOp().Set(5.0)
+
+    def aside(stage):
+        UsdGeom.Camera(stage.GetPrimAtPath("/Rig/Camera")).CreateHorizontalApertureOffsetAttr(3.0)
+
+    for name, change, words in (
+        ("a.usda", tilt, "5.0 degrees off its normal"),
+        ("b.usda", aside, "offset film"),
+        ("c.usda", lambda stage: stage.RemovePrim("/Rig/Lamp"), "no light"),
+        ("d.usda", lambda stage: stage.RemovePrim("/Rig/Camera"), "no camera"),
+        ("e.usda", lambda stage: stage.RemovePrim("/Rig/Sample"), "nothing lies on the axis"),
+    ):
+        with pytest.raises(UsdfabError, match=words):
+            read_rig(changed(name, change))
 
 
 def test_bad_rigs(fabric, tmp_path):

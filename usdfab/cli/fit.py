@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -38,6 +39,15 @@ def run(
         str | None,
         Parameter(help="Use only X0,Y0,X1,Y1 of the picture: pixels from the top left, or e.g. 25%,25%,75%,75%."),
     ] = None,
+    rig: Annotated[
+        Path | None,
+        Parameter(
+            help="Rig stage of the photo: its camera, looking straight down, and its lights; else both are found."
+        ),
+    ] = None,
+    save_rig: Annotated[
+        Path | None, Parameter(help="Write the rig that was found, for `usdfab render FABRIC --rig` (new .usda file).")
+    ] = None,
     stages: Annotated[
         str,
         Parameter(
@@ -67,11 +77,11 @@ def run(
     The analysis stage reads counts, weave, colours, widths and twist from the photo; fiber parameters it cannot see
     are priors, and what is uncertain is said. The network stage weighs counts, weave and widths with its own guess.
     The raster stage then moves shape and appearance until a rasterized picture resembles the photo, the match stage
-    shape, appearance and exposure until a path-traced one does, the path stage colours and roughnesses by gradients of
-    the path tracer; each of these three is slow, and is used only where it comes closer. Ctrl-C ends them early with
-    the best so far. What is finished is kept beside OUTPUT until the fit is done; after a break --resume goes on from
-    there, to the same result. A photo that shows no woven fabric ends with exit code 3 and what was measured; nothing
-    is written then, unless --force is given.
+    shape, appearance, exposure and lamp until a path-traced one does, the path stage colours and roughnesses by
+    gradients of the path tracer; each of these three is slow, and is used only where it comes closer. Ctrl-C ends
+    them early with the best so far. What is finished is kept beside OUTPUT until the fit is done; after a break
+    --resume goes on from there, to the same result. A photo that shows no woven fabric ends with exit code 3 and
+    what was measured; nothing is written then, unless --force is given.
 
     Usage examples:
 
@@ -79,6 +89,7 @@ def run(
         usdfab fit photo.tif -o fabric.usda --pixel-size 7.5um --report report --json
         usdfab fit photo.png -o fabric.usda --size 3.6mm --crop 100,100,900,700
         usdfab fit photo.png -o fabric.usda --size 3.6mm --stages analysis,match --quality standard
+        usdfab fit photo.png -o fabric.usda --rig microscope.usda --stages analysis,match
         usdfab fit photo.png -o fabric.usda --size 3.6mm --stages analysis,raster,path --quality standard --resume
 
     Parameters
@@ -95,8 +106,18 @@ def run(
     from usdfab.imaging import check_denoiser
     from usdfab.usd.atomic import USD_SUFFIXES
     from usdfab.usd.fabric_io import write_fabric
+    from usdfab.usd.rig import rig_for, write_rig
 
     checked_output(output, USD_SUFFIXES, overwrite=overwrite)
+    if save_rig is not None:
+        checked_output(save_rig, USD_SUFFIXES, overwrite=overwrite)
+        if rig is not None:
+            raise UsdfabError("the rig is given: there is none to save", place="--save-rig", remedy="leave one out")
+    known = None
+    if rig is not None:
+        from usdfab.usd.read_rig import read_rig
+
+        known = read_rig(rig)
     if report is not None:
         check_report_folder(report, overwrite=overwrite)
     if denoise:
@@ -105,6 +126,8 @@ def run(
         raise UsdfabError(f"{seed} is not between 0 and 2^31 - 1", place="--seed")
     width = parse_length(size) if size else None
     pixel = parse_length(pixel_size) if pixel_size else None
+    if known is not None and width is None and pixel is None:
+        width = known.sample_size[0]
     region = parse_region(crop, "--crop")
     files = CheckpointFiles(output)
     left = files.existing()
@@ -127,8 +150,11 @@ def run(
             checkpoint=files,
             resume=resume,
             force=force,
+            rig=known,
         )
     write_fabric(fit.fabric, output, overwrite=overwrite)
+    if save_rig is not None:
+        write_rig(save_rig, fit.fabric.size, rig=fit.rig or rig_for(fit.fabric.size), overwrite=overwrite)
     stopped = next((stage.name for stage in fit.stages if stage.interrupted), None)
     if stopped is None:
         files.remove()
@@ -151,6 +177,7 @@ def run(
                 "fabric": as_table(fit.fabric),
                 "analysis": _analysis(fit),
                 "exposure": fit.exposure,
+                "rig": None if fit.rig is None or known is not None else asdict(fit.rig),
                 "stages": _stages(fit),
                 "pictures": {name: path for name, path in pictures.items() if name != PAGE},
                 "report": pictures.get(PAGE),

@@ -50,6 +50,8 @@ class YarnParameters:
     ply_count: int = _default("ply_count")
     ply_twist: float = _default("ply_twist")
     irregularity: float = _default("irregularity")
+    unevenness: float = _default("unevenness")
+    waviness: float = _default("waviness")
     migration: float = _default("migration")
     migration_rate: float = _default("migration_rate")
     flyaway_density: float = _default("flyaway_density")

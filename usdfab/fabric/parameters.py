@@ -136,6 +136,20 @@ YARN_PARAMETERS: tuple[Parameter, ...] = (
         ("raster",),
     ),
     Parameter(
+        "unevenness", "CV", "1", "float", 0.0, (0.0, 0.6), (0.0, 0.3),
+        "Standard deviation of the yarn's thickness along it, over its mean; over about a cell. Spun yarns have 0.1 to "
+        "0.2, filament yarns next to none.",
+        ("match",),
+        since=3,
+    ),
+    Parameter(
+        "waviness", "w_yarn", "1", "float", 0.0, (0.0, 2.0), (0.0, 0.5),
+        "Standard deviation of the yarn's sideways place about a straight line, in half widths of the yarn (radius "
+        "times flattening); over about a cell.",
+        ("match",),
+        since=3,
+    ),
+    Parameter(
         "migration", "G", "1", "float", 0.75, (0.0, 1.0), (0.66, 0.84),
         "How far fibers wander between the yarn's axis and its surface (Li et al. 2024, eq. 7).",
         ("network",),

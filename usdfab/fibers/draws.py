@@ -12,11 +12,12 @@ from usdfab.fabric import SYSTEMS, ply_circles
 from usdfab.fibers.cross_section import JITTER, fiber_radius
 from usdfab.fibers.randomness import hash_integers, normal, uniform
 from usdfab.fibers.segments import Layout
+from usdfab.fibers.unevenness import highest
 
 Floats = NDArray[np.float64]
 
-_PHASE, _VARIANT, _ROTATION = 6, 7, 8
-"""Channels of draws that Li et al. 2024 do not have."""
+_PHASE, _VARIANT, _ROTATION, _THICKNESS, _WANDER = 6, 7, 8, 10, 11
+"""Channels of draws that Li et al. 2024 do not have (9 is that of flyaways)."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class Draws:
     ``jitter`` (J S), ``theta0``, ``xi``: (yarns, fibers); ``kappa``: (yarns, fibers, segments), U(-1, 1).
     Of ``plies`` plies, fiber i belongs to ply ``i % plies``, in which it is number ``i // plies``; all plies hold
     equally many. ``phase`` (yarns,) radians is where ply 0 starts; fibers of a ply share their ``kappa``.
+    ``thickness`` and ``wander`` (yarns, cells along) are standard normal: what a yarn's unevenness and its sideways
+    wandering are interpolated from, see ``unevenness.interpolated``.
     """
 
     jitter: Floats
@@ -35,6 +38,8 @@ class Draws:
     noise_seed: int
     plies: int = 1
     phase: Floats = field(default_factory=lambda: np.zeros(1))
+    thickness: Floats = field(default_factory=lambda: np.zeros((1, 1)))
+    wander: Floats = field(default_factory=lambda: np.zeros((1, 1)))
 
     @property
     def fibers(self) -> int:
@@ -56,6 +61,7 @@ def draw(layout: Layout, fiber_count: int, seed: int, plies: int = 1) -> Draws:
     # The highest point of a segment moves for each fiber (eq. 9); plies would dissolve, so there it moves for each ply.
     moves = fiber if plies == 1 else fiber % plies
     phase = 2.0 * math.pi * uniform(seed, system, yarn[:, 0], _PHASE) if plies > 1 else np.zeros(layout.yarns)
+    knot = np.arange(layout.length)
     return Draws(
         jitter=JITTER * uniform(*key, 0, 0) * normal(*key, 0, 1),
         theta0=2.0 * math.pi * uniform(*key, 0, 2),
@@ -64,6 +70,8 @@ def draw(layout: Layout, fiber_count: int, seed: int, plies: int = 1) -> Draws:
         noise_seed=int(hash_integers(seed, system, 5) >> np.uint64(33)),
         plies=plies,
         phase=phase,
+        thickness=normal(seed, system, yarn, knot, _THICKNESS),
+        wander=normal(seed, system, yarn, knot, _WANDER),
     )
 
 
@@ -86,7 +94,8 @@ XI_SHIFT = 1.0
 class Variation:
     """What a variant adds to the draws: ``draw + weight * mask * change``, the weight varying along the yarn.
 
-    ``jitter``, ``theta0``, ``xi`` (yarns, fibers), ``kappa`` (yarns, fibers, segments): changes of the draws.
+    ``jitter``, ``theta0``, ``xi`` (yarns, fibers), ``kappa`` (yarns, fibers, segments), ``thickness``, ``wander``
+    (yarns, cells along): changes of the draws. The latter two are 0 for yarns that vary not in all of their fibers.
     ``rotation`` (yarns,) radians: turn of the yarn's whole cross-section. ``weight`` (stations,): 0 with zero first
     and second derivatives towards the patch's border, 1 in the middle. ``mask`` (yarns, fibers): 0 for curves that
     must be the same in all variants.
@@ -96,6 +105,8 @@ class Variation:
     theta0: Floats
     xi: Floats
     kappa: Floats
+    thickness: Floats
+    wander: Floats
     rotation: Floats
     weight: Floats
     mask: Floats
@@ -143,6 +154,8 @@ def variation(
     variant: int,
     room: Floats,
     margin: float,
+    unevenness: float = 0.0,
+    waviness: float = 0.0,
 ) -> Variation:
     """The changes of the draws that make variant ``variant`` (1, 2, ...) of the tile.
 
@@ -155,6 +168,8 @@ def variation(
         that may get further, with the common draws or the variant's, stays as it is.
     margin: cells
         How near to the patch's border along the yarn no fiber may vary.
+    unevenness, waviness:
+        Of the yarns, see ``YarnShape``.
     """
     other = draw(layout, draws.fibers, int(hash_integers(seed, _VARIANT, variant) >> np.uint64(33)), draws.plies)
     system = SYSTEMS.index(layout.system)
@@ -162,16 +177,25 @@ def variation(
     farthest = np.maximum(reach(draws, draws.jitter), reach(draws, other.jitter))
     # A curve is a blend of its own fiber and its successor.
     farthest = np.maximum(farthest, np.take_along_axis(farthest, successor, axis=1))
+    # Uneven yarns bulge, and wander sideways, by no more than this (one set of changes is blended into the other).
+    bulge, shift = (
+        np.maximum(highest(getattr(draws, name)), highest(getattr(other, name)))[:, None]
+        for name in ("thickness", "wander")
+    )
+    farthest = farthest * (1.0 + unevenness * bulge) + waviness * shift
     mask = (farthest < room[:, None]).astype(float)
     # The step's steepest slope is 15 / 8. A cross-section turns as one or not at all.
     most = 2.0 * math.pi * MAX_ROTATION_RATE * max(ramp(layout, margin)[1], 0.0) * 8.0 / 15.0
-    rotation = most * mask.min(axis=1) * (2.0 * uniform(seed, system, yarn, variant, _ROTATION) - 1.0)
+    as_one = mask.min(axis=1)
+    rotation = most * as_one * (2.0 * uniform(seed, system, yarn, variant, _ROTATION) - 1.0)
     return Variation(
         jitter=other.jitter - draws.jitter,
         # The shorter way round, so that no fiber wanders more than it must.
         theta0=np.mod(other.theta0 - draws.theta0 + math.pi, 2.0 * math.pi) - math.pi,
         xi=XI_SHIFT * (other.xi / 50.0 - 1.0),
         kappa=other.kappa - draws.kappa,
+        thickness=as_one[:, None] * (other.thickness - draws.thickness),
+        wander=as_one[:, None] * (other.wander - draws.wander),
         rotation=rotation,
         weight=variation_weight(layout, margin),
         mask=mask,

@@ -32,6 +32,7 @@ from usdfab.fibers.cross_section import fiber_angle, fiber_radius, migrated_radi
 from usdfab.fibers.draws import Draws, Variation
 from usdfab.fibers.noise import perlin3
 from usdfab.fibers.segments import Layout
+from usdfab.fibers.unevenness import THINNEST, interpolated
 
 SEGMENT_INDEX_PER_CELL = 8.0
 """lambda_seg of eq. 9 counts this many per cell: at Q = 0.15 the vertical noise has about one bump per cell."""
@@ -45,7 +46,7 @@ class YarnShape:
     """The numbers that the fibers' shape depends on differentiably: floats, or 0-d arrays of any array library.
 
     ``radius`` in metres, ``inclination`` in radians, ``twist`` and ``ply_twist`` in turns per cell, the others without
-    unit. How many plies there are is a matter of ``Draws``.
+    unit; ``waviness`` in half widths of the yarn. How many plies there are is a matter of ``Draws``.
     """
 
     radius: Any
@@ -57,6 +58,8 @@ class YarnShape:
     migration: Any
     migration_rate: Any
     ply_twist: Any = 0.0
+    unevenness: Any = 0.0
+    waviness: Any = 0.0
 
     @classmethod
     def of(cls, yarn: YarnParameters) -> YarnShape:
@@ -185,6 +188,9 @@ class _Raw:
         shape, shape2 = self.shape, fiber.shape
         place = layout.position[None, :] + shift
         across, height = self._cross_section(fiber, place)
+        thickness = xp.clip(1.0 + shape.unevenness * xp.asarray(self._along("thickness")), THINNEST, None)
+        across = thickness * across + shape.waviness * xp.asarray(self._along("wander"))
+        height = thickness * height
 
         # Centre line with its highest point moved: z'_cen of eq. 9, with y^kappa on the normalised place.
         length = xp.asarray(layout.segment_length[None, :])
@@ -227,6 +233,15 @@ class _Raw:
             radius * x + xp.asarray(distance * np.cos(center)),
             radius * z + xp.asarray(distance * np.sin(center)),
         )
+
+    def _along(self, name: str) -> NDArray[np.float64]:
+        """(1, stations) a random curve along the yarns; it closes over the patch by itself."""
+        yarn, place = self.layout.yarn, self.layout.position
+        common = interpolated(getattr(self.draws, name), yarn, place)
+        if self.variation is None:
+            return common[None, :]
+        change = interpolated(getattr(self.variation, name), yarn, place)
+        return (common + self.variation.weight * change)[None, :]
 
     def _drawn(self, name: str, fiber: NDArray, *segment: NDArray) -> NDArray[np.float64]:
         """A draw for each fiber and station, the variant's changes included."""

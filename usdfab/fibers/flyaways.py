@@ -24,6 +24,7 @@ from usdfab.fibers.draws import Draws
 from usdfab.fibers.fibers import closed_twist
 from usdfab.fibers.randomness import normal, uniform
 from usdfab.fibers.segments import Layout
+from usdfab.fibers.unevenness import THINNEST, interpolated
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -231,9 +232,20 @@ def _place(
         start = start + 2.0 * math.pi * (twist * y_root + ply / plies) + draws.phase[owner][:, None]
     own_twist = yarn.twist if plies == 1 else yarn.ply_twist
     angle = start + 2.0 * math.pi * own_twist * (y - y_root) + sideways / (root + np.maximum(h, 0.0))
-    across = yarn.flattening * (distance * np.cos(center) + root * np.cos(angle)) + h * np.cos(angle)
-    height = distance * np.sin(center) + root * np.sin(angle) + h * np.sin(angle)
+    thickness, wander = _uneven(yarn, draws, owner[:, None], y)
+    across = yarn.flattening * thickness * (distance * np.cos(center) + root * np.cos(angle)) + h * np.cos(angle)
+    across = across + yarn.flattening * yarn.radius * wander
+    height = thickness * (distance * np.sin(center) + root * np.sin(angle)) + h * np.sin(angle)
     return across, height + yarn.crimp * yarn.radius * _centerlines(yarn, layout, owner, y)
+
+
+def _uneven(yarn: YarnParameters, draws: Draws, owner: Ints, y: Floats) -> tuple[Floats, Floats]:
+    """Thickness of the yarns over its mean, and their sideways place in half widths, at ``y`` cells.
+
+    Those of variant 0: in the others a yarn that wanders otherwise carries its flyaways a fraction of its width off.
+    """
+    thickness = np.maximum(1.0 + yarn.unevenness * interpolated(draws.thickness, owner, y), THINNEST)
+    return thickness, yarn.waviness * interpolated(draws.wander, owner, y)
 
 
 def _centerlines(yarn: YarnParameters, layout: Layout, owner: Ints, y: Floats) -> Floats:

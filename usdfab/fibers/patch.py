@@ -210,7 +210,10 @@ class YarnSystem:
             room = np.minimum(middle, width - middle) - self.radius - SIDE_BAND * self.across_cell
             half_width = self.yarn.radius * self.yarn.flattening
             margin = self.radius / self.along_cell + SIDE_BAND
-            changes = variation(layout, draws, self.successor, self.seed, variant, room / half_width, margin)
+            changes = variation(
+                layout, draws, self.successor, self.seed, variant, room / half_width, margin,
+                self.yarn.unevenness, self.yarn.waviness,
+            )  # fmt: skip
         across, height = fiber_offsets(shape, layout, draws, self.successor, variation=changes)
         along = np.broadcast_to(layout.position * self.along_cell, across.shape)
         points = self._placed(along, across, height, layout.yarn)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from usdfab.fabric import SYSTEMS, Color, FabricParameters, System
 from usdfab.tracer import RenderSettings, Tracer
-from usdfab.usd.rig import swatch_scene
+from usdfab.usd.rig import Rig, sample_scene
 
 LADDER = ((0.02, 0.3, 0.8), (0.1, 0.55, 0.93), (0.97, 0.99, 0.999))
 """Albedos rendered, three channels at a time."""
@@ -57,9 +57,13 @@ class BrightnessCurve:
 
 
 def brightness_curves(
-    fabric: FabricParameters, paths: int = PATHS, seed: int = 0, progress: Callable[[int, int], None] | None = None
+    fabric: FabricParameters,
+    paths: int = PATHS,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    rig: Rig | None = None,
 ) -> dict[System, BrightnessCurve]:
-    """Measure both systems' curves by rendering ``fabric`` with the ladder of grey albedos."""
+    """Measure both systems' curves by rendering ``fabric`` with the ladder of grey albedos, under ``rig``."""
     albedo: list[float] = []
     seen: dict[System, list[float]] = {"warp": [], "weft": []}
     for step, rung in enumerate(LADDER):
@@ -68,7 +72,7 @@ def brightness_curves(
             warp=replace(fabric.warp, albedo=rung, yarn_albedo=()),
             weft=replace(fabric.weft, albedo=rung, yarn_albedo=()),
         )
-        means = visible_means(grey, paths, seed)
+        means = visible_means(grey, paths, seed, rig)
         albedo.extend(rung)
         for system in SYSTEMS:
             seen[system].extend(means[system])
@@ -111,14 +115,16 @@ def photo_exposure(shown: FabricParameters, curves: dict[System, BrightnessCurve
     return max(needed, math.sqrt(allowed))
 
 
-def visible_means(fabric: FabricParameters, paths: int = PATHS, seed: int = 0) -> dict[System, NDArray[np.float64]]:
+def visible_means(
+    fabric: FabricParameters, paths: int = PATHS, seed: int = 0, rig: Rig | None = None
+) -> dict[System, NDArray[np.float64]]:
     """Mean colour (3,) of each system in the rendered swatch, over the middles of the crossings where it is on top."""
     cells = np.array([fabric.size[0], fabric.size[1]]) / fabric.cell
     width = int(np.clip(PIXELS_PER_CELL * cells[0], 32, MAX_PIXELS))
     height = max(1, round(width * fabric.size[1] / fabric.size[0]))
     spp = max(1, round(paths / (width * height)))
     # One variant of the repeat shows the same colours as several, which take as many times as long to build.
-    scene = swatch_scene(replace(fabric, variants=1))
+    scene = sample_scene(replace(fabric, variants=1), rig)
     render = Tracer(scene).render(scene.cameras[0], RenderSettings((width, height), spp=spp, seed=seed))
     return means_on_top(render.pixels, fabric)
 
@@ -143,6 +149,7 @@ def with_inverted_albedo(
     paths: int = PATHS,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
+    rig: Rig | None = None,
 ) -> tuple[FabricParameters, tuple[str, ...]]:
     """``fabric`` with albedos such that it shows the colours its albedos held before; notes on what is too bright.
 
@@ -153,7 +160,7 @@ def with_inverted_albedo(
     factors = {s: np.ones(3) for s in SYSTEMS}
     found = _read_backwards(fabric, curves, factors)
     for step in range(REFINEMENTS):
-        shown = visible_means(found, paths, seed + 1 + step)
+        shown = visible_means(found, paths, seed + 1 + step, rig)
         for system in SYSTEMS:
             ratio = wanted[system] / np.maximum(shown[system], 1e-6)
             factors[system] = factors[system] * np.clip(ratio, 0.5, 2.0) ** OVER_RELAXATION

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from usdfab.files import whole_file
 from usdfab.fit.analysis import PhotoAnalysis, YarnSystem
 from usdfab.fit.dataset.records import fabric_from_table
 from usdfab.fit.stages import StageOutcome
+from usdfab.usd.rig import Rig
 
 FORMAT = "usdfab-fit/1"
 STATE_SUFFIXES = {"raster": "safetensors", "match": "npz", "path": "npz"}
@@ -75,8 +76,10 @@ class FitCheckpoint:
     stages: list[tuple[str, StageOutcome]] = field(default_factory=list)
 
     @classmethod
-    def begin(cls, file: Path | None, about: Mapping[str, Any], resume: bool) -> FitCheckpoint:
+    def begin(cls, file: Path | None, about: Mapping[str, Any], resume: bool, rig: Rig | None = None) -> FitCheckpoint:
         """The checkpoint in ``file`` if it is to be resumed and is there, else an empty one.
+
+        ``rig`` is the photo's, where that is known: all stages have it then, and ``about`` says which it is.
 
         Raises
         ------
@@ -85,7 +88,7 @@ class FitCheckpoint:
         """
         if not (resume and file is not None and file.exists()):
             return cls(file, dict(about))
-        return _load(file, dict(about))
+        return _load(file, dict(about), rig)
 
     def finished(self, number: int, name: str, job: str) -> StageOutcome | None:
         """The outcome of the stage at this place in the order, or None where it has to be run (again)."""
@@ -133,7 +136,7 @@ class FitCheckpoint:
             ) from error
 
 
-def _load(file: Path, about: dict[str, Any]) -> FitCheckpoint:
+def _load(file: Path, about: dict[str, Any], rig: Rig | None) -> FitCheckpoint:
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
         if data["format"] != FORMAT:
@@ -148,7 +151,7 @@ def _load(file: Path, about: dict[str, Any]) -> FitCheckpoint:
                 remedy="give the same options, or start anew with --overwrite",
             )
         photo = (_analysis(data["analysis"]), fabric_from_table(data["shown"]), tuple(data["notes"]))
-        return FitCheckpoint(file, about, photo, [(stage["job"], _stage(stage)) for stage in data["stages"]])
+        return FitCheckpoint(file, about, photo, [(stage["job"], _stage(stage, rig)) for stage in data["stages"]])
     except OSError as error:
         raise UsdfabError(f"cannot be read ({error.strerror or error})", place=str(file)) from error
     except UsdfabError as error:
@@ -208,12 +211,14 @@ def _stage_table(stage: StageOutcome) -> dict[str, Any]:
         "losses": [loss if math.isfinite(loss) else None for loss in stage.losses],
         "distance": stage.distance,
         "exposure": stage.exposure,
+        "rig": None if stage.rig is None or stage.rig.lights is not None else asdict(stage.rig),
         "notes": list(stage.notes),
         "uncertainty": dict(stage.uncertainty),
     }
 
 
-def _stage(table: dict[str, Any]) -> StageOutcome:
+def _stage(table: dict[str, Any], rig: Rig | None) -> StageOutcome:
+    own = table["rig"]
     return StageOutcome(
         table["name"],
         fabric_from_table(table["fabric"]),
@@ -223,5 +228,6 @@ def _stage(table: dict[str, Any]) -> StageOutcome:
         tuple(table["notes"]),
         halfway=None if table["halfway"] is None else fabric_from_table(table["halfway"]),
         exposure=float(table["exposure"]),
+        rig=rig if own is None else Rig(**own | {"sample_size": tuple(own["sample_size"])}),
         uncertainty=dict(table["uncertainty"]),
     )

@@ -19,7 +19,7 @@ from usdfab.fit.straighten import straightened
 from usdfab.imaging import denoise, linear_to_srgb, side_by_side, srgb_to_linear, write_image
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.fabric_io import write_fabric
-from usdfab.usd.rig import swatch_scene
+from usdfab.usd.rig import Rig, sample_scene
 
 if TYPE_CHECKING:
     from usdfab.fit.features import FeatureNet
@@ -168,7 +168,7 @@ def _fitted(
         raise KeyboardInterrupt
     write_fabric(fit.fabric, asset, overwrite=True)
     goal = photo_middle(fit)
-    pictures = {stage.name: stage.exposure * swatch(stage.fabric, seed) for stage in fit.stages}
+    pictures = {stage.name: stage.exposure * swatch(stage.fabric, seed, stage.rig) for stage in fit.stages}
     write_image(folder / f"{photo.stem}.png", side_by_side([goal, *pictures.values()]), overwrite=True)
     distances = {name: gram_distance(goal, picture, net) for name, picture in pictures.items()}
     files.remove()
@@ -183,9 +183,9 @@ def photo_middle(fit: Fit) -> NDArray[np.float32]:
     return straightened(fit.photo[top : top + side, left : left + side], 0.0, 1.0, SIDE / side)
 
 
-def swatch(fabric: FabricParameters, seed: int = 0) -> NDArray[np.float32]:
-    """A denoised picture of the whole fabric, ``SIDE`` pixels along its shorter side."""
-    scene = swatch_scene(fabric)
+def swatch(fabric: FabricParameters, seed: int = 0, rig: Rig | None = None) -> NDArray[np.float32]:
+    """A denoised picture of the whole fabric under ``rig``, ``SIDE`` pixels along its shorter side."""
+    scene = sample_scene(fabric, rig)
     scale = SIDE / min(fabric.size)
     size = (round(scale * fabric.size[0]), round(scale * fabric.size[1]))
     render = Tracer(scene).render(scene.cameras[0], RenderSettings(size, spp=SAMPLES, seed=seed + 1))

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from usdfab.fit.match_stage import MatchSettings
     from usdfab.fit.path_settings import PathSettings
     from usdfab.fit.raster_stage import StageSettings
+    from usdfab.usd.rig import Rig
 
 SECONDS_PER_SAMPLE, SECONDS_PER_ITERATION = 2e-4, 4.0
 """Of the raster stage, about."""
@@ -43,6 +44,8 @@ class LaterStages:
         In order; empty where the fit ends with the analysis.
     raster, path, match:
         Settings of the stages; the raster stage's also say how all are judged. None where ``names`` is empty.
+    rig:
+        The photo's, where it is known; None leaves it to the stages to find.
     """
 
     names: tuple[str, ...]
@@ -52,10 +55,17 @@ class LaterStages:
     seed: int = 0
     albedo_paths: int = 0
     files: CheckpointFiles | None = None
+    rig: Rig | None = None
 
     @classmethod
     def of(
-        cls, wanted: tuple[str, ...], quality: str, seed: int, albedo_paths: int, files: CheckpointFiles | None
+        cls,
+        wanted: tuple[str, ...],
+        quality: str,
+        seed: int,
+        albedo_paths: int,
+        files: CheckpointFiles | None,
+        rig: Rig | None = None,
     ) -> LaterStages:
         """The stages of ``wanted`` after the analysis, in a quality.
 
@@ -74,7 +84,7 @@ class LaterStages:
         raster = checked_quality(quality)
         # The exposure is found before: the path stage is to leave it as it is.
         path = settings_for(quality, seed=seed, gain=False)  # type: ignore[arg-type]
-        return cls(names, raster, path, checked_match_quality(quality, seed), seed, albedo_paths, files)
+        return cls(names, raster, path, checked_match_quality(quality, seed), seed, albedo_paths, files, rig)
 
     def costs(self) -> dict[str, float]:
         """Seconds that each stage takes, about."""
@@ -140,7 +150,7 @@ class LaterStages:
 
         assert self.path is not None
         own = {"path": replace(self.path, threads=None), "match": self.match}.get(name)
-        return fingerprint(last.fabric, last.halfway, last.exposure, self.raster, own)
+        return fingerprint(last.fabric, last.halfway, last.exposure, last.rig, self.raster, own)
 
     def _run(
         self,
@@ -157,14 +167,15 @@ class LaterStages:
             from usdfab.fit.network.stage import run_network
 
             guess, _ = run_network(
-                analysis, shown, photo, seed=self.seed, albedo_paths=self.albedo_paths, progress=course.stage(name)
-            )
-            return last.distance, replace(guess, exposure=last.exposure)
+                analysis, shown, photo, seed=self.seed, albedo_paths=self.albedo_paths, rig=self.rig,
+                progress=course.stage(name),
+            )  # fmt: skip
+            return last.distance, replace(guess, exposure=last.exposure, rig=last.rig)
         if name == "raster":
             before, after = run_raster(
                 last.fabric, shown, photo, rotation, self.raster, seed=self.seed, exposure=last.exposure,
-                albedo_paths=self.albedo_paths, checkpoint=self.files.of(name) if self.files else None, resume=True,
-                progress=course.stage(name),
+                rig=last.rig, albedo_paths=self.albedo_paths, checkpoint=self.files.of(name) if self.files else None,
+                resume=True, progress=course.stage(name),
             )  # fmt: skip
             return before.distance, after
         if name == "match":
@@ -172,19 +183,21 @@ class LaterStages:
 
             assert self.match is not None
             return run_match(
-                last.fabric, photo, rotation, self.match, self.raster, exposure=last.exposure, distance=last.distance,
+                last.fabric, photo, rotation, self.match, self.raster, exposure=last.exposure, rig=last.rig,
+                rig_known=self.rig is not None, distance=last.distance,
                 checkpoint=self.files.of(name) if self.files else None, progress=course.stage(name),
             )  # fmt: skip
         from usdfab.fit.path_run import run_path
 
         return run_path(
             last.fabric, photo, rotation, self.path, self.raster, halfway=last.halfway, exposure=last.exposure,
-            distance=last.distance, checkpoint=self.files.of(name) if self.files else None, progress=course.stage(name),
+            rig=last.rig, distance=last.distance, checkpoint=self.files.of(name) if self.files else None,
+            progress=course.stage(name),
         )  # fmt: skip
 
 
 def _interrupted(name: str, last: StageOutcome) -> StageOutcome:
     return StageOutcome(
-        name, last.fabric, 0.0, distance=last.distance, exposure=last.exposure,
+        name, last.fabric, 0.0, distance=last.distance, exposure=last.exposure, rig=last.rig,
         notes=(f"the {name} stage was interrupted: not used",), interrupted=True,
     )  # fmt: skip

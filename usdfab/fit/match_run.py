@@ -18,6 +18,7 @@ from usdfab.imaging import check_denoiser
 if TYPE_CHECKING:
     from usdfab.fit.match_stage import MatchSettings
     from usdfab.fit.raster_stage import StageSettings
+    from usdfab.usd.rig import Rig
 
 Progress = Callable[[str, int, int], None]
 
@@ -30,6 +31,8 @@ def run_match(
     judge: StageSettings,
     *,
     exposure: float = 1.0,
+    rig: Rig | None = None,
+    rig_known: bool = False,
     distance: float | None = None,
     checkpoint: Path | None = None,
     progress: Progress | None = None,
@@ -46,6 +49,8 @@ def run_match(
         Of the stage, and of the raster stage of the same quality: by its statistics all stages are judged.
     exposure:
         How many times brighter the photo is than the start under the rig's standard light.
+    rig, rig_known:
+        Camera and lamps so far, None for the paper's, and whether the photo's are known.
     distance:
         That of ``start``, where it is known.
     checkpoint:
@@ -70,9 +75,9 @@ def run_match(
     say("judging the start of the match stage", 0, steps)
     before = distance
     if before is None:
-        before = stages.traced_distance(start, judged, judge, net, settings.seed, exposure)
+        before = stages.traced_distance(start, judged, judge, net, settings.seed, exposure, rig)
     result = match_photo(
-        start, goal, settings, net=net, exposure=exposure, checkpoint=checkpoint,
+        start, goal, settings, net=net, exposure=exposure, rig=rig, rig_known=rig_known, checkpoint=checkpoint,
         progress=lambda done, _, loss: say(f"match, loss {loss:.3f}", done, steps),
     )  # fmt: skip
     notes = []
@@ -80,13 +85,13 @@ def run_match(
         notes.append(f"the match stage was interrupted after {max(0, len(result.losses) - 1)} steps")
     say("judging the match stage", steps - 1, steps)
     # Other draws than those that were matched.
-    after = stages.traced_distance(result.fabric, judged, judge, net, settings.seed + 1, result.exposure)
-    found, light, unsure = result.fabric, result.exposure, result.uncertainty
+    after = stages.traced_distance(result.fabric, judged, judge, net, settings.seed + 1, result.exposure, result.rig)
+    found, light, lamps, unsure = result.fabric, result.exposure, result.rig, result.uncertainty
     if not after < before:
         notes.append(f"the match stage did not come closer to the photo ({before:.3f}, then {after:.3f}): not used")
-        found, light, unsure = start, exposure, {}
+        found, light, lamps, unsure = start, exposure, rig, {}
     outcome = StageOutcome(
         "match", found, time.perf_counter() - begun, result.losses, min(before, after), tuple(notes),
-        result.interrupted, exposure=light, uncertainty=unsure,
+        result.interrupted, exposure=light, rig=lamps, uncertainty=unsure,
     )  # fmt: skip
     return before, outcome

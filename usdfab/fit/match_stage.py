@@ -21,14 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
-from usdfab.fabric import SYSTEMS, FabricParameters
+from usdfab.fabric import FabricParameters
 from usdfab.files import whole_file
+from usdfab.fit.match_looks import Seen, looks_at, questions
 from usdfab.fit.match_space import EXPOSURE, MOVES, MatchSpace
 from usdfab.fit.match_steps import broyden_update, damped_step, normal_equations, soft_l1
 from usdfab.imaging import denoise
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.tracer.checkpoint import fingerprint
-from usdfab.usd.rig import swatch_scene
+from usdfab.usd.rig import Rig, sample_scene
 
 if TYPE_CHECKING:
     from usdfab.fit.features import FeatureNet
@@ -37,18 +38,13 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-FORMAT = "usdfab-match/1"
+FORMAT = "usdfab-match/2"
 LONGEST_STEP = 2.0
 DAMPINGS = (0.01, 0.1, 1.0)
 """Tried one after another until a step leads down; each iteration begins with the one that last did."""
 
-WIDTHS = (1.0, 0.85, 0.72)
-"""Of the yarns, times the start's, that are tried before the first round: how dark the valleys between yarns are
-decides more than all else, and from touching yarns the way to separate ones leads uphill."""
-
-PLIES = (1, 2)
 LIGHTS = (0.75, 1.0, 1.33, 1.75)
-"""Exposures, times the start's, with which each of these is seen."""
+"""Exposures, times the best so far, in which each first look is taken."""
 
 VARIED_CELLS = 16
 """Crossings of all variants of the repeat together beyond which pictures show fewer variants."""
@@ -96,14 +92,13 @@ class MatchSettings:
         """How many pictures are rendered at most, about."""
         systems, channels = 2, 3
         coordinates = systems * (len(self.free) + (channels - 1 if "albedo" in self.free else 0))
-        return len(self.starts) + self.iterations * (coordinates + self.steps * len(DAMPINGS))
+        looks = 1 + sum(map(len, questions(self.shapes, rig_known=False)))
+        return looks + self.iterations * (coordinates + self.steps * len(DAMPINGS))
 
     @property
-    def starts(self) -> tuple[tuple[float, int], ...]:
-        """Widths of yarns and numbers of plies that are tried first; one pair where shapes are not free."""
-        if "radius" in self.free and "flattening" in self.free:
-            return tuple((width, plies) for plies in PLIES for width in WIDTHS)
-        return ((1.0, 1),)
+    def shapes(self) -> bool:
+        """Whether the shape of yarns is free, so that the first looks may change it."""
+        return "radius" in self.free and "flattening" in self.free
 
 
 QUALITIES: dict[str, MatchSettings] = {
@@ -120,8 +115,8 @@ class MatchResult:
 
     Parameters
     ----------
-    fabric, exposure:
-        The best point; what its picture is multiplied by to be as bright as the target.
+    fabric, exposure, rig:
+        The best point; what its picture under the rig is multiplied by to be as bright as the target.
     losses:
         Of the start and after each step that was taken.
     uncertainty:
@@ -136,6 +131,7 @@ class MatchResult:
     losses: tuple[float, ...]
     uncertainty: dict[str, float]
     interrupted: bool
+    rig: Rig | None = None
 
 
 @dataclass(eq=False)
@@ -145,13 +141,13 @@ class _State:
     round: int
     point: Floats
     losses: list[float]
-    start: int = 0
+    answers: tuple[int, ...] = ()
     light: float = 1.0
     damping: int = 0
     deviations: Floats | None = None
 
 
-class _Seen:
+class _Pictures:
     """Pictures of fabrics, and how their statistics differ from the target's."""
 
     def __init__(self, target: Target, settings: MatchSettings) -> None:
@@ -168,11 +164,12 @@ class _Seen:
     def _upper(statistics: tuple) -> list[tuple[NDArray, NDArray]]:
         return [np.triu_indices(s.shape[-1]) if s.ndim == 3 else (np.arange(s.shape[-1]),) * 2 for s in statistics]
 
-    def picture(self, fabric: FabricParameters) -> Singles:
+    def picture(self, fabric: FabricParameters, rig: Rig | None) -> Singles:
         """(H, W, 3) linear, denoised, at exposure 1."""
         repeat = math.prod(fabric.repeat())
         # Statistics need only so many different crossings; each is fibers to build and to keep.
-        scene = swatch_scene(replace(fabric, variants=max(1, min(fabric.variants, VARIED_CELLS // repeat))))
+        fewer = replace(fabric, variants=max(1, min(fabric.variants, VARIED_CELLS // repeat)))
+        scene = sample_scene(fewer, rig)
         width = self.settings.width
         size = (width, max(1, round(width * fabric.size[1] / fabric.size[0])))
         render = Tracer(scene).render(
@@ -206,6 +203,8 @@ def match_photo(
     *,
     net: FeatureNet,
     exposure: float = 1.0,
+    rig: Rig | None = None,
+    rig_known: bool = False,
     checkpoint: Path | None = None,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> MatchResult:
@@ -221,6 +220,8 @@ def match_photo(
         See ``features.load_features``.
     exposure:
         What pictures are multiplied by at the start, see ``albedo.photo_exposure``.
+    rig, rig_known:
+        Camera and lamps at the start (None: the paper's), and whether these are the photo's or only a first guess.
     checkpoint:
         A file that keeps the state after each round; if it is there and belongs to the same run, the run goes on from
         it to the same result. It is left there at the end.
@@ -237,12 +238,12 @@ def match_photo(
     from usdfab.fit.texture import Target
 
     picture = torch.from_numpy(np.ascontiguousarray(goal, dtype=np.float32)).permute(2, 0, 1)
-    seen = _Seen(Target.from_image(picture, net, settings.levels, settings.kind), settings)
-    identity = fingerprint(start, np.asarray(goal, dtype=np.float32), settings, float(exposure))
+    pictures = _Pictures(Target.from_image(picture, net, settings.levels, settings.kind), settings)
+    identity = fingerprint(start, np.asarray(goal, dtype=np.float32), settings, float(exposure), rig, rig_known)
     state = None
     if checkpoint is not None and checkpoint.exists():
         state = _load(checkpoint, identity)
-    search = _Search(start, exposure, seen, settings, state, progress)
+    search = _Search(Seen(start, rig), rig_known, exposure, pictures, settings, state, progress)
     space, state = search.space, search.state
     interrupted = False
     try:
@@ -257,71 +258,68 @@ def match_photo(
     deviations = state.deviations if state.deviations is not None else np.zeros(len(space.names))
     return MatchResult(
         space.fabric(state.point), space.exposure(state.point), tuple(state.losses),
-        {k: v for k, v in space.deviations(state.point, deviations).items() if v > 0.0}, interrupted,
+        {k: v for k, v in space.deviations(state.point, deviations).items() if v > 0.0}, interrupted, search.rig,
     )  # fmt: skip
-
-
-def first_look(start: FabricParameters, width: float, plies: int) -> FabricParameters:
-    """``start`` with yarns narrower by the factor ``width``, first rounder, then thinner, and so many plies.
-
-    The plies are twisted as the fibers were, for what a photo shows of twist is the slant of the lines on the yarn, and
-    the fibers in them the other way. A yarn that has plies keeps them.
-    """
-    fabric = start
-    for system in SYSTEMS:
-        yarn = start.system(system)
-        flattening = max(min(yarn.flattening, 1.0), yarn.flattening * width)
-        radius = yarn.radius * width * yarn.flattening / flattening
-        yarn = replace(yarn, flattening=flattening, radius=radius)
-        if plies > 1 and yarn.ply_count == 1:
-            yarn = replace(yarn, ply_count=plies, ply_twist=-yarn.twist)
-        fabric = replace(fabric, **{system: yarn})  # type: ignore[arg-type]
-    return fabric
 
 
 class _Search:
     def __init__(
         self,
-        start: FabricParameters,
+        start: Seen,
+        rig_known: bool,
         exposure: float,
-        seen: _Seen,
+        pictures: _Pictures,
         settings: MatchSettings,
         state: _State | None,
         progress: Callable[[int, int, float], None] | None,
     ) -> None:
-        self.seen, self.settings, self.fresh = seen, settings, state is None
-        self.space = MatchSpace.about(start, settings.free, exposure)
+        self.pictures, self.settings, self.fresh = pictures, settings, state is None
+        self.start, self.rig = start, start.rig
+        self.questions = questions(settings.shapes, rig_known)
+        self.space = MatchSpace.about(start.fabric, settings.free, exposure)
         self.state = state or _State(0, np.zeros(len(self.space.names)), [])
         self._progress = progress or (lambda *_: None)
-        self._starts = [first_look(start, *look) for look in settings.starts]
         self._each = len(self.space.names) + settings.steps * len(DAMPINGS)
         self._done = self.state.round * self._each
         self.loss = math.inf
 
     def begin(self) -> None:
-        """Choose a start, or look at the point where the search stood."""
+        """Take the first looks, or go back to the point where the search stood."""
         state, exposure = self.state, self.space.light
         if not self.fresh:
-            self.space = replace(self.space, start=self._starts[state.start], light=exposure * state.light)
-            self._done += len(self._starts) - 1
+            self._settle(exposure)
+            self._done += sum(map(len, self.questions))
             self.picture, self.residuals, self.loss = self._look(state.point)
             return
-        for k, start in enumerate(self._starts):
-            picture = self.seen.picture(start)
-            self._done += 1
-            # Where there is no choice of starts, the start's exposure is taken as it is.
-            for light in LIGHTS if len(self._starts) > 1 else (1.0,):
-                residuals = self.seen.residuals(picture, exposure * light)
-                loss = soft_l1(residuals, self.seen.weights)
-                if k == 0 and light == 1.0:
-                    state.losses.append(loss)
-                if loss < self.loss:
-                    self.picture, self.residuals, self.loss = picture, residuals, loss
-                    state.start, state.light = k, light
-            self._tell(self.loss)
-        if (state.start, state.light) != (0, 1.0):
-            state.losses.append(self.loss)
-        self.space = replace(self.space, start=self._starts[state.start], light=exposure * state.light)
+        self._try((), exposure, lights=(1.0,))
+        state.losses.append(self.loss)
+        for question in self.questions:
+            before, kept = self.loss, state.answers
+            state.answers = (*kept, -1)
+            for answer in range(len(question)):
+                self._try((*kept, answer), exposure, lights=LIGHTS)
+            if self.loss < before:
+                state.losses.append(self.loss)
+        self._settle(exposure)
+
+    def _try(self, answers: tuple[int, ...], exposure: float, lights: tuple[float, ...]) -> None:
+        """Look at some answers in several lights, about that which suited the best answers so far."""
+        seen = looks_at(self.start, self.questions, answers)
+        picture = self.pictures.picture(seen.fabric, seen.rig)
+        self._done += 1
+        light_before = self.state.light
+        for light in lights:
+            residuals = self.pictures.residuals(picture, exposure * light_before * light)
+            loss = soft_l1(residuals, self.pictures.weights)
+            if loss < self.loss:
+                self.picture, self.residuals, self.loss = picture, residuals, loss
+                self.state.answers, self.state.light = answers, light_before * light
+        self._tell(self.loss)
+
+    def _settle(self, exposure: float) -> None:
+        seen = looks_at(self.start, self.questions, self.state.answers)
+        self.space = replace(self.space, start=seen.fabric, light=exposure * self.state.light)
+        self.rig = seen.rig
 
     def round(self) -> None:
         """One round of finite differences, and the steps that follow from it."""
@@ -329,10 +327,10 @@ class _Search:
         before = self._done
         jacobian = self._jacobian()
         for _ in range(settings.steps):
-            matrix, gradient = normal_equations(self.residuals, jacobian, self.seen.weights)
+            matrix, gradient = normal_equations(self.residuals, jacobian, self.pictures.weights)
             if not self._step(matrix, gradient, jacobian):
                 break
-        matrix, _ = normal_equations(self.residuals, jacobian, self.seen.weights)
+        matrix, _ = normal_equations(self.residuals, jacobian, self.pictures.weights)
         state.deviations = self._deviations(matrix)
         state.round += 1
         self._done = before + self._each
@@ -343,7 +341,7 @@ class _Search:
             ahead = self.state.point.copy()
             ahead[k] += 1.0
             if name == EXPOSURE:
-                moved = self.seen.residuals(self.picture, self.space.exposure(ahead))
+                moved = self.pictures.residuals(self.picture, self.space.exposure(ahead))
             else:
                 _, moved, _ = self._look(ahead)
             rows.append(moved - self.residuals)
@@ -368,10 +366,10 @@ class _Search:
         return False
 
     def _look(self, point: Floats) -> tuple[Singles, Singles, float]:
-        picture = self.seen.picture(self.space.fabric(point))
-        residuals = self.seen.residuals(picture, self.space.exposure(point))
+        picture = self.pictures.picture(self.space.fabric(point), self.rig)
+        residuals = self.pictures.residuals(picture, self.space.exposure(point))
         prior = 0.5 * self.settings.prior * float(np.sum((point / self.space.spread) ** 2))
-        loss = soft_l1(residuals, self.seen.weights) + prior
+        loss = soft_l1(residuals, self.pictures.weights) + prior
         self._done += 1
         self._tell(min(loss, self.loss))
         return picture, residuals, loss
@@ -387,7 +385,7 @@ class _Search:
 
 def _save(path: Path, identity: str, state: _State) -> None:
     about = json.dumps({"format": FORMAT, "identity": identity, "round": state.round})
-    numbers = {"start": state.start, "light": state.light, "damping": state.damping, "point": state.point}
+    numbers = {"answers": state.answers, "light": state.light, "damping": state.damping, "point": state.point}
     try:
         with whole_file(path) as temporary, temporary.open("wb") as stream:
             np.savez(stream, about=about, losses=state.losses, deviations=state.deviations, **numbers)  # type: ignore[arg-type]
@@ -404,7 +402,8 @@ def _load(path: Path, identity: str) -> _State:
             if about["format"] != FORMAT:
                 raise ValueError
             state = _State(
-                int(about["round"]), data["point"], data["losses"].tolist(), int(data["start"]), float(data["light"]),
+                int(about["round"]), data["point"], data["losses"].tolist(), tuple(data["answers"].tolist()),
+                float(data["light"]),
                 int(data["damping"]), data["deviations"],
             )  # fmt: skip
             same = about["identity"] == identity

@@ -14,7 +14,7 @@ from usdfab.fabric import FabricParameters
 from usdfab.fit import stages
 from usdfab.fit.stages import StageOutcome
 from usdfab.fit.straighten import straightened
-from usdfab.usd.rig import rig_for, swatch_scene
+from usdfab.usd.rig import Rig, rig_for, swatch_scene
 
 if TYPE_CHECKING:
     from usdfab.fit.path_result import PathResult
@@ -36,6 +36,7 @@ def run_path(
     *,
     halfway: FabricParameters | None = None,
     exposure: float = 1.0,
+    rig: Rig | None = None,
     distance: float | None = None,
     checkpoint: Path | None = None,
     progress: Progress | None = None,
@@ -54,6 +55,8 @@ def run_path(
         ``StageOutcome.halfway``: the stage starts from it where its picture is closer to the photo.
     exposure:
         How many times brighter the photo is than under the rig's standard light, to which albedos belong.
+    rig:
+        Camera and lights; None is the paper's.
     distance:
         That of ``start``, where it is known.
     checkpoint:
@@ -75,7 +78,7 @@ def run_path(
     steps = settings.iterations + 2
 
     def judged(fabric: FabricParameters) -> float:
-        return stages.traced_distance(fabric, goal, judge, net, settings.seed, exposure)
+        return stages.traced_distance(fabric, goal, judge, net, settings.seed, exposure, rig)
 
     say("judging the start of the path stage", 0, steps)
     before = judged(start) if distance is None else distance
@@ -90,7 +93,7 @@ def run_path(
     seen = (target.shape[1] / scale, target.shape[0] / scale)
     result = refine_appearance(
         begin, target / np.float32(exposure), settings=settings,
-        scene=swatch_scene(begin, rig_for(start.size).with_sample(seen)),
+        scene=swatch_scene(begin, (rig or rig_for(start.size)).with_sample(seen)),
         checkpoint=checkpoint, progress=lambda done, _, loss: say(f"path, loss {loss:.3f}", 1 + done, steps),
         keep_interrupted=True,
     )  # fmt: skip
@@ -104,7 +107,7 @@ def run_path(
         found, unsure = start, {}
     outcome = StageOutcome(
         "path", found, time.perf_counter() - begun, tuple(float(x) for x in result.losses[:, 0]), min(before, after),
-        tuple(notes), result.interrupted, exposure=exposure, uncertainty=unsure,
+        tuple(notes), result.interrupted, exposure=exposure, rig=rig, uncertainty=unsure,
     )  # fmt: skip
     return before, outcome
 

@@ -29,6 +29,8 @@ from usdfab.fit.later_stages import LaterStages
 from usdfab.fit.photo_input import DEFAULT_WIDTH as DEFAULT_WIDTH, Crop, Photo, load_photo
 from usdfab.fit.priors import fabric_from_analysis
 from usdfab.fit.stages import StageOutcome, checked_stages
+from usdfab.tracer.checkpoint import fingerprint
+from usdfab.usd.rig import Rig
 
 ANALYSIS_SECONDS = 15.0
 """What the analysis takes, about, with the renders that find albedos."""
@@ -40,8 +42,8 @@ class Fit:
 
     ``photo`` is the linear picture (H, W, 3); ``size_source`` says where the physical size comes from; ``warnings``
     are sentences for people; ``stages`` is what each stage found, in order; ``doubts`` are what in the photo makes the
-    fit unsure, and about which parameters. A render of the fabric under the capture rig, times ``exposure``, is as
-    bright as the photo.
+    fit unsure, and about which parameters. A render of the fabric under ``rig`` (None: the paper's), times
+    ``exposure``, is as bright as the photo.
     """
 
     fabric: FabricParameters
@@ -52,6 +54,7 @@ class Fit:
     stages: tuple[StageOutcome, ...] = ()
     doubts: tuple[Doubt, ...] = ()
     exposure: float = 1.0
+    rig: Rig | None = None
 
 
 def fit_photo(
@@ -68,6 +71,7 @@ def fit_photo(
     checkpoint: CheckpointFiles | None = None,
     resume: bool = False,
     force: bool = False,
+    rig: Rig | None = None,
 ) -> Fit:
     """Estimate a fabric from one photo.
 
@@ -94,6 +98,9 @@ def fit_photo(
         analysis ends the fit with the best so far, and that stage is marked as interrupted.
     force:
         Go on where the photo shows no woven cloth, with a warning.
+    rig:
+        Camera and lights of the photo, where they are known (``read_rig``). Otherwise the paper's, until the match
+        stage finds that others explain the photo better.
 
     Raises
     ------
@@ -104,19 +111,19 @@ def fit_photo(
         for a checkpoint of another fit.
     """
     wanted = checked_stages(stages)
-    later = LaterStages.of(wanted, quality, seed, albedo_paths, checkpoint)
+    later = LaterStages.of(wanted, quality, seed, albedo_paths, checkpoint, rig)
     photo = load_photo(path, width, pixel_size, crop)
     if checkpoint is not None and not resume:
         checkpoint.remove()
     about = {
         "photo": photo.sha256, "size": photo.width, "crop": photo.box, "seed": seed, "paths": albedo_paths,
-        "force": force, "version": __version__,
+        "force": force, "rig": fingerprint(rig) if rig else None, "version": __version__,
     }  # fmt: skip
-    kept = FitCheckpoint.begin(checkpoint.fit if checkpoint else None, about, resume)
+    kept = FitCheckpoint.begin(checkpoint.fit if checkpoint else None, about, resume, rig)
     first = kept.finished(0, "analysis", "")
     course = Course(progress, ({} if first else {"analysis": ANALYSIS_SECONDS}) | later.costs())
     if first is None:
-        first = _analysed(photo, path, seed, albedo_paths, force, kept, course.stage("analysis"))
+        first = _analysed(photo, path, seed, albedo_paths, force, rig, kept, course.stage("analysis"))
         kept.add("", first)
     course.finish("analysis")
     assert kept.photo is not None
@@ -128,10 +135,18 @@ def fit_photo(
             0, f"nothing says how large the photo is: its width is taken as {DEFAULT_WIDTH * 1e3:g} mm; use --size"
         )
     outcomes = later.run(first, shown, photo.pixels, analysis, kept, course)
-    exposure = outcomes[-1].exposure
+    exposure, found_rig = outcomes[-1].exposure, outcomes[-1].rig
     warnings += dict.fromkeys(note for outcome in outcomes for note in outcome.notes)
     light = f"the photo is {exposure:.2f} times as bright as under the rig's standard light"
-    notes = [f"size from {photo.size_source}", light, *photo.notes, *_confidences(analysis), *warnings, *prior_notes]
+    notes = [
+        f"size from {photo.size_source}",
+        light,
+        *_lamps(rig, found_rig),
+        *photo.notes,
+        *_confidences(analysis),
+        *warnings,
+        *prior_notes,
+    ]
     provenance = Provenance(
         source=Path(path).name,
         source_sha256=photo.sha256,
@@ -140,12 +155,15 @@ def fit_photo(
         notes=tuple(notes),
     )
     fabric = replace(outcomes[-1].fabric, provenance=provenance)
-    return Fit(fabric, analysis, photo.pixels, photo.size_source, tuple(warnings), outcomes, doubts, exposure)
+    return Fit(
+        fabric, analysis, photo.pixels, photo.size_source, tuple(warnings), outcomes, doubts, exposure, found_rig
+    )
 
 
 def _analysed(
-    photo: Photo, path: str | Path, seed: int, albedo_paths: int, force: bool, kept: FitCheckpoint, say: Progress
-) -> StageOutcome:
+    photo: Photo, path: str | Path, seed: int, albedo_paths: int, force: bool, rig: Rig | None, kept: FitCheckpoint,
+    say: Progress,
+) -> StageOutcome:  # fmt: skip
     """The first stage. What the photo showed goes into ``kept``."""
     begun = time.perf_counter()
     ladder, steps = len(LADDER), 2 + len(LADDER) + REFINEMENTS
@@ -153,7 +171,7 @@ def _analysed(
     analysis = analyze_photo(photo.pixels.astype(np.float64), str(path), force=force)
     shown, prior_notes = fabric_from_analysis(analysis, photo.width, seed, _prim_name(Path(path).stem))
     curves = brightness_curves(
-        shown, albedo_paths, seed=seed, progress=lambda done, _: say("measuring albedo", 2 + done, steps)
+        shown, albedo_paths, seed=seed, rig=rig, progress=lambda done, _: say("measuring albedo", 2 + done, steps)
     )
     exposure = photo_exposure(shown, curves)
     shown = dimmed(shown, exposure)
@@ -163,9 +181,25 @@ def _analysed(
         curves,
         albedo_paths,
         seed=seed,
+        rig=rig,
         progress=lambda done, _: say("measuring albedo", 2 + ladder + done, steps),
     )
-    return StageOutcome("analysis", fabric, time.perf_counter() - begun, notes=tuple(notes), exposure=exposure)
+    return StageOutcome("analysis", fabric, time.perf_counter() - begun, notes=tuple(notes), exposure=exposure, rig=rig)
+
+
+def _lamps(given: Rig | None, found: Rig | None) -> list[str]:
+    if given is not None:
+        return ["camera and lights are those of the rig that was given"]
+    if found is None:
+        return []
+    elevation = np.degrees(np.arctan2(found.light_height, found.light_side))
+    if found.lamps > 1:
+        return [f"the photo looks as if lit by a ring lamp {elevation:.0f} degrees above the cloth"]
+    side = np.degrees(found.azimuth) % 360.0
+    return [
+        f"the photo looks as if lit by a lamp {elevation:.0f} degrees above the cloth, from {side:.0f} degrees "
+        "(0 is right, 90 up)"
+    ]
 
 
 def _confidences(analysis: PhotoAnalysis) -> list[str]:

@@ -22,7 +22,7 @@ from usdfab.fit.raster.unconstrained import FREE_NAMES, Parameters, parameters_o
 from usdfab.fit.straighten import straightened as straightened
 from usdfab.fit.texture import DEFAULT_KIND, LEVELS, Kind, Target, color_loss, texture_loss
 from usdfab.tracer.checkpoint import fingerprint
-from usdfab.usd.rig import swatch_scene
+from usdfab.usd.rig import Rig, sample_scene
 
 Floats = NDArray[np.float64]
 Quality = Literal["draft", "standard", "paper"]
@@ -118,6 +118,7 @@ def refine_by_raster(
     settings: StageSettings | None = None,
     *,
     net: FeatureNet | None = None,
+    rig: Rig | None = None,
     diffuse: float | Floats | None = None,
     checkpoint: Path | None = None,
     resume: bool = False,
@@ -134,6 +135,8 @@ def refine_by_raster(
         size may differ from the render's.
     net:
         The feature network; the shipped one by default.
+    rig:
+        Camera and point lights; None is the paper's.
     diffuse:
         k_d to start from, a number or (K, 3); by default what gives the render the target's mean colour.
     checkpoint, resume:
@@ -149,11 +152,11 @@ def refine_by_raster(
     net = net or load_features(dtype=fast_dtype())
     picture = torch.from_numpy(np.ascontiguousarray(target, dtype=np.float32)).permute(2, 0, 1)
     goal = Target.from_image(picture, net, settings.levels, settings.kind)
-    renderer = _renderer(fabric, settings)
+    renderer = _renderer(fabric, settings, rig)
     if diffuse is None:
         diffuse = matching_diffuse(renderer, np.asarray(target).mean(axis=(0, 1)))
     parameters = parameters_of(fabric, diffuse, free=_moving(settings))
-    job = fingerprint(fabric, np.asarray(target), np.asarray(diffuse), replace(settings, iterations=0))
+    job = fingerprint(fabric, np.asarray(target), np.asarray(diffuse), replace(settings, iterations=0), rig)
     if resume and checkpoint is not None and checkpoint.exists():
         state = load_state(checkpoint, job)
     else:
@@ -178,10 +181,10 @@ def render_size(fabric: FabricParameters, width: int) -> tuple[int, int]:
     return width, max(1, round(width * fabric.size[1] / fabric.size[0]))
 
 
-def _renderer(fabric: FabricParameters, settings: StageSettings) -> RasterRenderer:
+def _renderer(fabric: FabricParameters, settings: StageSettings, rig: Rig | None = None) -> RasterRenderer:
     size = render_size(fabric, settings.width)
     raster = RasterSettings(size, settings.supersampling, single=settings.single, diffuse=settings.diffuse)
-    return raster_renderer(swatch_scene(fabric), raster)
+    return raster_renderer(sample_scene(fabric, rig), raster)
 
 
 def _loss(

@@ -19,7 +19,7 @@ from usdfab.fit.straighten import straightened
 from usdfab.imaging import denoise, side_by_side, write_image
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.drape import drape_scene
-from usdfab.usd.rig import swatch_scene
+from usdfab.usd.rig import sample_scene
 
 HEIGHT = 480
 """Rows of the report's pictures."""
@@ -85,7 +85,7 @@ def write_report(
     """
     target = Path(folder)
     earlier, curves = fit.stages[:-1], [stage for stage in fit.stages if len(stage.losses) > 1]
-    shown = {f"after_{stage.name}": stage.fabric for stage in earlier} | {"swatch": fit.fabric}
+    shown = {f"after_{stage.name}": (stage.fabric, stage.rig) for stage in earlier} | {"swatch": (fit.fabric, fit.rig)}
     names = ["photo", *shown, "comparison", "difference", "drape", *(f"{stage.name}_loss" for stage in curves)]
     paths = {name: target / f"{name}.png" for name in names} | {PAGE: target / f"{PAGE}.html"}
     check_report_folder(target, overwrite=overwrite)
@@ -98,7 +98,7 @@ def write_report(
         raise UsdfabError(f"cannot make the folder ({error.strerror})", place=str(target)) from error
     photo = resized(fit.photo, HEIGHT)
     size = (photo.shape[1], photo.shape[0])
-    scenes = {name: (swatch_scene(fabric), size) for name, fabric in shown.items()}
+    scenes = {name: (sample_scene(*seen), size) for name, seen in shown.items()}
     scenes["drape"] = (drape_scene(fit.fabric, DRAPE_SIZE[0] / DRAPE_SIZE[1]), DRAPE_SIZE)
     course = Course(lambda _, done, total: progress(done, total) if progress else None, dict.fromkeys(scenes, 1.0))
     pictures = {"photo": photo}

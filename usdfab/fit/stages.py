@@ -17,7 +17,7 @@ from usdfab.fit.albedo import LADDER, PATHS, REFINEMENTS, brightness_curves, wit
 from usdfab.fit.extra import require_fit_extra
 from usdfab.imaging import denoise
 from usdfab.tracer import RenderSettings, Tracer
-from usdfab.usd.rig import swatch_scene
+from usdfab.usd.rig import Rig, sample_scene
 
 if TYPE_CHECKING:
     from usdfab.fit.features import FeatureNet
@@ -41,8 +41,9 @@ class StageOutcome:
     photo by the losses of the fit, where that was measured; ``notes`` are sentences for people; ``interrupted`` after
     Ctrl-C. ``halfway`` is the raster stage's fabric with the albedos (C + k_d) / 2 (Li et al. 2024, 7.3), another start
     for the path stage. ``exposure`` is how many times brighter the photo is than the analysis' picture under the rig's
-    standard light, see ``albedo.photo_exposure``. ``uncertainty`` of parameters by name, where the stage knows any, in
-    their own units.
+    standard light, see ``albedo.photo_exposure``; ``rig`` is the rig of these pictures where a stage found that the
+    paper's is not the photo's, whatever its sample size. ``uncertainty`` of parameters by name, where the stage knows
+    any, in their own units.
     """
 
     name: str
@@ -54,6 +55,7 @@ class StageOutcome:
     interrupted: bool = False
     halfway: FabricParameters | None = None
     exposure: float = 1.0
+    rig: Rig | None = None
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -87,6 +89,7 @@ def run_raster(
     *,
     seed: int = 0,
     exposure: float = 1.0,
+    rig: Rig | None = None,
     albedo_paths: int = PATHS,
     checkpoint: Path | None = None,
     resume: bool = False,
@@ -104,6 +107,8 @@ def run_raster(
         (H, W, 3) linear, its whole width ``start.size[0]``; turn of the cloth in it, radians.
     exposure:
         How many times brighter the photo is than under the rig's standard light, to which albedos belong.
+    rig:
+        Camera and lights; None is the paper's.
     checkpoint, resume:
         As ``raster_stage.refine_by_raster``.
 
@@ -128,7 +133,7 @@ def run_raster(
     ladder, extra = len(LADDER), len(LADDER) + REFINEMENTS
     steps = settings.iterations + extra + 1
     result = refine_by_raster(
-        tame, target / np.float32(exposure), settings, net=net, checkpoint=checkpoint, resume=resume,
+        tame, target / np.float32(exposure), settings, net=net, rig=rig, checkpoint=checkpoint, resume=resume,
         progress=lambda done, _, loss: say(f"raster, loss {loss:.3f}", done, steps),
     )  # fmt: skip
     notes += result.notes
@@ -142,21 +147,26 @@ def run_raster(
     )
     done = settings.iterations
     curves = brightness_curves(
-        dyed, albedo_paths, seed=seed, progress=lambda k, _: say("measuring albedo", done + k, steps)
+        dyed, albedo_paths, seed=seed, rig=rig, progress=lambda k, _: say("measuring albedo", done + k, steps)
     )
     found, albedo_notes = with_inverted_albedo(
-        dyed, curves, albedo_paths, seed=seed, progress=lambda k, _: say("measuring albedo", done + ladder + k, steps)
+        dyed,
+        curves,
+        albedo_paths,
+        seed=seed,
+        rig=rig,
+        progress=lambda k, _: say("measuring albedo", done + ladder + k, steps),
     )
     notes += albedo_notes
     halfway: FabricParameters | None = start_from_joint(result.fabric, result.diffuse)
     say("judging the raster stage", steps - 1, steps)
-    before, after = (traced_distance(fabric, target, settings, net, seed, exposure) for fabric in (start, found))
+    before, after = (traced_distance(fabric, target, settings, net, seed, exposure, rig) for fabric in (start, found))
     if not after < before:
         notes.append(f"the raster stage did not come closer to the photo ({before:.3f}, then {after:.3f}): not used")
         found, halfway = start, None
     seconds = time.perf_counter() - begun
     return (
-        StageOutcome("analysis", start, 0.0, distance=before, exposure=exposure),
+        StageOutcome("analysis", start, 0.0, distance=before, exposure=exposure, rig=rig),
         StageOutcome(
             "raster",
             found,
@@ -167,6 +177,7 @@ def run_raster(
             result.interrupted,
             halfway,
             exposure,
+            rig,
         ),
     )
 
@@ -178,17 +189,18 @@ def traced_distance(
     net: FeatureNet,
     seed: int = 0,
     exposure: float = 1.0,
+    rig: Rig | None = None,
 ) -> float:
     """Texture and colour loss of the path-traced, denoised swatch against a target at the scale of ``settings``.
 
-    The swatch is multiplied by ``exposure``.
+    The swatch, under ``rig`` or the paper's, is multiplied by ``exposure``.
     """
     import torch
 
     from usdfab.fit.raster_stage import render_size
     from usdfab.fit.texture import Target, color_loss, texture_loss
 
-    scene = swatch_scene(fabric)
+    scene = sample_scene(fabric, rig)
     size = render_size(fabric, settings.width)
     render = Tracer(scene).render(scene.cameras[0], RenderSettings(size, spp=JUDGE_PATHS_PER_PIXEL, seed=seed))
     shown = np.float32(exposure) * denoise(render.pixels, render.albedo, render.normal)

@@ -23,12 +23,13 @@ from usdfab.usd.fabric_io import preview_color, preview_roughness
 from usdfab.usd.problems import Problems
 from usdfab.usd.read_scene import read_scene
 from usdfab.usd.read_textures import albedo_map
-from usdfab.usd.scene import Camera, FabricSurface, Material, Mesh, PointLight, Scene
+from usdfab.usd.scene import Camera, FabricSurface, Light, Material, Mesh, PointLight, Scene
 from usdfab.usd.stage import new_stage, open_stage
 
 RIG_PATH = "/Rig"
 PLANE_FACTOR = 3.0
 """Side of the plane over the side of the view: light that enters outside the picture and scatters in is right."""
+MAX_LAMPS = 64
 _LAMP_RADIUS = 1e-3
 _FOCAL_LENGTH = 50.0
 
@@ -44,13 +45,23 @@ class Rig:
     camera_height, light_height:
         Above the sample.
     light_side:
-        Along +x from the camera's axis.
+        From the camera's axis.
+    lamps:
+        Equal lamps, evenly on the circle of radius ``light_side`` about the camera's axis: 1 is a lamp to the side,
+        many are a ring lamp, as microscopes have it. Together they are as strong as one.
+    azimuth:
+        Direction from the camera's axis to the first lamp, radians from +x towards +y.
+    lights:
+        Lights of a measured rig, in its own frame (``read_rig``); they take the place of the lamps.
     """
 
     sample_size: tuple[float, float]
     camera_height: float = 0.06
     light_height: float = 0.04
     light_side: float = 0.01
+    lamps: int = 1
+    azimuth: float = 0.0
+    lights: tuple[Light, ...] | None = None
 
     def __post_init__(self) -> None:
         if len(self.sample_size) != 2:
@@ -65,6 +76,10 @@ class Rig:
                 raise UsdfabError(f"{value} is not a height above 0", place=name)
         if not math.isfinite(self.light_side):
             raise UsdfabError(f"{self.light_side} is not a length", place="light_side")
+        if not math.isfinite(self.azimuth):
+            raise UsdfabError(f"{self.azimuth} is not an angle", place="azimuth")
+        if not 1 <= self.lamps <= MAX_LAMPS:
+            raise UsdfabError(f"{self.lamps} lamps are not between 1 and {MAX_LAMPS}", place="lamps")
 
     @property
     def tan_half(self) -> tuple[float, float]:
@@ -72,13 +87,19 @@ class Rig:
         return self.sample_size[0] / 2 / self.camera_height, self.sample_size[1] / 2 / self.camera_height
 
     @property
+    def light_positions(self) -> tuple[tuple[float, float, float], ...]:
+        """Positions of the lamps."""
+        angles = [self.azimuth + 2.0 * math.pi * k / self.lamps for k in range(self.lamps)]
+        return tuple((self.light_side * math.cos(a), self.light_side * math.sin(a), self.light_height) for a in angles)
+
+    @property
     def light_position(self) -> tuple[float, float, float]:
-        """Position of the lamp."""
-        return self.light_side, 0.0, self.light_height
+        """Position of the first lamp."""
+        return self.light_positions[0]
 
     @property
     def light_intensity(self) -> float:
-        """Intensity in W/sr at which a white diffuse sample has radiance 1 in the middle of the picture.
+        """Intensity in W/sr of all lamps at which a white diffuse sample has radiance 1 in the picture's middle.
 
         The irradiance there is I cos / d^2 and a white diffuse surface reflects E / pi, so I = pi d^2 / cos =
         pi d^3 / height. Towards the picture's border it falls off by less than 10 % for samples up to 5 mm.
@@ -96,6 +117,19 @@ def rig_for(sample_size: tuple[float, float]) -> Rig:
     rig = Rig(sample_size)
     factor = max(1.0, max(sample_size) / 0.03)
     return Rig(sample_size, factor * rig.camera_height, factor * rig.light_height, factor * rig.light_side)
+
+
+def ring_rig(sample_size: tuple[float, float], elevation: float, lamps: int = 8, azimuth: float = 0.0) -> Rig:
+    """``rig_for`` with lamps seen from the sample at ``elevation`` radians above it, as far away as its lamp.
+
+    Eight lamps look like a ring; one is a lamp to the side, towards ``azimuth``.
+    """
+    rig = rig_for(sample_size)
+    distance = math.hypot(rig.light_side, rig.light_height)
+    return replace(
+        rig, light_height=distance * math.sin(elevation), light_side=distance * math.cos(elevation), lamps=lamps,
+        azimuth=azimuth,
+    )  # fmt: skip
 
 
 def write_rig(
@@ -123,24 +157,33 @@ def write_rig(
 def define_rig(stage: Usd.Stage, rig: Rig, path: str | Sdf.Path = RIG_PATH) -> Usd.Prim:
     """Define the rig's prims below ``path``: ``Camera``, ``Lamp`` and ``Sample``. Returns the Xform at ``path``.
 
+    Several lamps are ``Lamp1``, ``Lamp2``, ... A rig that was read from a stage is not written again.
+
     The stage is taken to be in metres and z up. ``Sample`` is a plane ``PLANE_FACTOR`` times the view; its ``st`` is in
     metres, (0, 0) at the lower left corner of the view: one unit of uv is one metre.
     """
+    if rig.lights is not None:
+        raise UsdfabError("the lights of a rig that was read cannot be written", remedy="copy its file")
     path = Sdf.Path(path)
     root = UsdGeom.Xform.Define(stage, path).GetPrim()
     Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
     _define_camera(stage, path.AppendChild("Camera"), rig)
-    lamp = UsdLux.SphereLight.Define(stage, path.AppendChild("Lamp"))
-    lamp.CreateRadiusAttr(_LAMP_RADIUS)
-    lamp.CreateTreatAsPointAttr(True)
-    # As a point it has the intensity pi r^2 L (usdfab.usd.read_lights).
-    lamp.CreateIntensityAttr(rig.light_intensity / (math.pi * _LAMP_RADIUS**2))
-    lamp.CreateColorAttr(Gf.Vec3f(1.0))
-    lamp.CreateNormalizeAttr(False)
-    lamp.CreateExtentAttr([(-_LAMP_RADIUS,) * 3, (_LAMP_RADIUS,) * 3])
-    UsdGeom.Xformable(lamp).AddTranslateOp().Set(Gf.Vec3d(*rig.light_position))
+    for name, position in zip(_lamp_names(rig), rig.light_positions, strict=True):
+        lamp = UsdLux.SphereLight.Define(stage, path.AppendChild(name))
+        lamp.CreateRadiusAttr(_LAMP_RADIUS)
+        lamp.CreateTreatAsPointAttr(True)
+        # As a point it has the intensity pi r^2 L (usdfab.usd.read_lights).
+        lamp.CreateIntensityAttr(rig.light_intensity / rig.lamps / (math.pi * _LAMP_RADIUS**2))
+        lamp.CreateColorAttr(Gf.Vec3f(1.0))
+        lamp.CreateNormalizeAttr(False)
+        lamp.CreateExtentAttr([(-_LAMP_RADIUS,) * 3, (_LAMP_RADIUS,) * 3])
+        UsdGeom.Xformable(lamp).AddTranslateOp().Set(Gf.Vec3d(*position))
     _define_plane(stage, path.AppendChild("Sample"), rig)
     return root
+
+
+def _lamp_names(rig: Rig) -> list[str]:
+    return ["Lamp"] if rig.lamps == 1 else [f"Lamp{k + 1}" for k in range(rig.lamps)]
 
 
 def _define_camera(stage: Usd.Stage, path: Sdf.Path, rig: Rig) -> None:
@@ -213,6 +256,11 @@ def swatch_scene(
     return replace(scene, fabrics=tuple(_map_over_sample(surface) for surface in scene.fabrics))
 
 
+def sample_scene(fabric: FabricParameters, rig: Rig | None = None, *, strict: bool = False) -> Scene:
+    """``swatch_scene`` under ``rig``, or the paper's, with the fabric's size in view, whatever the rig's own is."""
+    return swatch_scene(fabric, rig.with_sample(fabric.size) if rig is not None else None, strict=strict)
+
+
 def _swatch(fabric: FabricParameters, rig: Rig, strict: bool) -> Scene:
     problems = Problems(strict=strict)
     points, uv = _plane(rig)
@@ -222,10 +270,13 @@ def _swatch(fabric: FabricParameters, rig: Rig, strict: bool) -> Scene:
     to_world = np.eye(4)
     to_world[2, 3] = rig.camera_height
     camera = Camera(f"{RIG_PATH}/Camera", to_world, np.asarray(rig.tan_half), np.zeros(2), 0.0)
-    light = PointLight(f"{RIG_PATH}/Lamp", np.asarray(rig.light_position), np.full(3, rig.light_intensity))
+    lights: tuple[Light, ...] = rig.lights or tuple(
+        PointLight(f"{RIG_PATH}/{name}", np.asarray(position), np.full(3, rig.light_intensity / rig.lamps))
+        for name, position in zip(_lamp_names(rig), rig.light_positions, strict=True)
+    )
     look = Material(f"{RIG_PATH}/Fabric", 0, np.asarray(preview_color(fabric)), preview_roughness(fabric), 0.0, 1.0)
     surface = _map_over_sample(FabricSurface(look.path, fabric, 1.0, albedo_map(fabric, look.path, problems)))
-    return Scene("swatch", (mesh,), (look,), (surface,), (camera,), (light,), tuple(problems.warnings), "Z")
+    return Scene("swatch", (mesh,), (look,), (surface,), (camera,), lights, tuple(problems.warnings), "Z")
 
 
 def _map_over_sample(surface: FabricSurface) -> FabricSurface:

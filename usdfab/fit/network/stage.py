@@ -16,6 +16,7 @@ from usdfab.fit.network.network_file import Weights, load_network
 from usdfab.fit.network.predict import predict
 from usdfab.fit.network.targets import NAMES
 from usdfab.fit.stages import StageOutcome
+from usdfab.usd.rig import Rig
 
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, steps done, steps to do)."""
@@ -59,6 +60,7 @@ def run_network(
     weights: Weights | None = None,
     seed: int = 0,
     albedo_paths: int = PATHS,
+    rig: Rig | None = None,
     progress: Progress | None = None,
 ) -> tuple[StageOutcome, FabricParameters]:
     """The network stage as the pipeline runs it: the guess, then albedos such that it shows the photo's colours.
@@ -77,10 +79,10 @@ def run_network(
     say("network", 0, steps)
     guessed, notes = guessed_fabric(analysis, shown, photo, weights)
     curves = brightness_curves(
-        guessed, albedo_paths, seed=seed, progress=lambda done, _: say("measuring albedo", 1 + done, steps)
+        guessed, albedo_paths, seed=seed, rig=rig, progress=lambda done, _: say("measuring albedo", 1 + done, steps)
     )
     found, more = with_inverted_albedo(
-        guessed, curves, albedo_paths, seed=seed,
+        guessed, curves, albedo_paths, seed=seed, rig=rig,
         progress=lambda done, _: say("measuring albedo", 1 + len(LADDER) + done, steps),
     )  # fmt: skip
     seconds = time.perf_counter() - begun
