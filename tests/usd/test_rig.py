@@ -186,17 +186,21 @@ def test_rigs_that_a_photo_cannot_have(tmp_path):
         return path
 
     def tilt(stage):
-        UsdGeom.Xformable(stage.GetPrimAtPath("/Rig/Camera")).AddRotateXOp().Set(5.0)
+        UsdGeom.Xformable(stage.GetPrimAtPath("/Rig/Camera")).AddRotateXOp().Set(3.0)
+
+    def away(stage):
+        UsdGeom.Xformable(stage.GetPrimAtPath("/Rig/Camera")).AddRotateXOp().Set(90.0)
 
     def aside(stage):
         UsdGeom.Camera(stage.GetPrimAtPath("/Rig/Camera")).CreateHorizontalApertureOffsetAttr(3.0)
 
     for name, change, words in (
-        ("a.usda", tilt, "5.0 degrees off its normal"),
+        ("a.usda", tilt, "3.0 degrees off its normal"),
         ("b.usda", aside, "offset film"),
         ("c.usda", lambda stage: stage.RemovePrim("/Rig/Lamp"), "no light"),
         ("d.usda", lambda stage: stage.RemovePrim("/Rig/Camera"), "no camera"),
-        ("e.usda", lambda stage: stage.RemovePrim("/Rig/Sample"), "nothing lies on the axis"),
+        ("e.usda", away, "nothing lies on the axis"),
+        ("f.usda", lambda stage: stage.RemovePrim("/Rig/Sample"), "no visible mesh"),
     ):
         with pytest.raises(UsdfabError, match=words):
             read_rig(changed(name, change))

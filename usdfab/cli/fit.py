@@ -126,8 +126,6 @@ def run(
         raise UsdfabError(f"{seed} is not between 0 and 2^31 - 1", place="--seed")
     width = parse_length(size) if size else None
     pixel = parse_length(pixel_size) if pixel_size else None
-    if known is not None and width is None and pixel is None:
-        width = known.sample_size[0]
     region = parse_region(crop, "--crop")
     files = CheckpointFiles(output)
     left = files.existing()

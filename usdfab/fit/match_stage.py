@@ -101,8 +101,14 @@ class MatchSettings:
         return "radius" in self.free and "flattening" in self.free
 
 
+DRAFTED = (
+    "radius", "flattening", "crimp", "twist", "unevenness", "waviness", "fiber_count", "flyaway_density",
+    "roughness_azimuthal", "albedo", EXPOSURE,
+)  # fmt: skip
+"""What a draft moves: what one round can settle, and is seen at its resolution."""
+
 QUALITIES: dict[str, MatchSettings] = {
-    "draft": MatchSettings(width=128, spp=8, iterations=1, levels=(1, 2)),
+    "draft": MatchSettings(width=192, spp=4, iterations=1, free=DRAFTED),
     "standard": MatchSettings(),
     "paper": MatchSettings(width=360, spp=16, iterations=4, levels=(1, 2, 4)),
 }

@@ -80,8 +80,8 @@ def fit_photo(
     path:
         An image file of woven cloth seen straight from above, yarns roughly along the picture's sides.
     width, pixel_size:
-        Physical width of the whole picture, before the crop, or of one pixel, in metres. Without both, the file's
-        resolution tags count; without those, ``DEFAULT_WIDTH``, with a warning.
+        Physical width of the whole picture, before the crop, or of one pixel, in metres. Without both, the rig's field
+        of view counts; without a rig, the file's resolution tags; without those, ``DEFAULT_WIDTH``, with a warning.
     seed:
         Fixes the fabric's random draws and those of the renders made on the way.
     progress:
@@ -112,7 +112,10 @@ def fit_photo(
     """
     wanted = checked_stages(stages)
     later = LaterStages.of(wanted, quality, seed, albedo_paths, checkpoint, rig)
-    photo = load_photo(path, width, pixel_size, crop)
+    if rig is not None and width is None and pixel_size is None:
+        photo = replace(load_photo(path, rig.sample_size[0], None, crop), size_source="the rig")
+    else:
+        photo = load_photo(path, width, pixel_size, crop)
     if checkpoint is not None and not resume:
         checkpoint.remove()
     about = {

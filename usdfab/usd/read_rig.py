@@ -54,7 +54,8 @@ def read_rig(path: str | Path) -> Rig:
         )
     to_rig = _rig_frame(camera, height)
     gain = 2.0**camera.exposure
-    width, depth = (2.0 * height * float(t) for t in camera.tan_half)
+    # A camera's numbers are singles: their rounding is no part of the size.
+    width, depth = (float(f"{2.0 * height * float(t):.6g}") for t in camera.tan_half)
     return Rig(
         (width, depth), camera_height=height, lights=tuple(_moved(light, to_rig, gain) for light in scene.lights)
     )
