@@ -40,7 +40,7 @@ Singles = NDArray[np.float32]
 
 FORMAT = "usdfab-match/2"
 LONGEST_STEP = 2.0
-DAMPINGS = (0.01, 0.1, 1.0)
+DAMPINGS = (0.01, 0.1, 1.0, 10.0)
 """Tried one after another until a step leads down; each iteration begins with the one that last did."""
 
 LIGHTS = (0.75, 1.0, 1.33, 1.75)
@@ -151,6 +151,16 @@ class _State:
     light: float = 1.0
     damping: int = 0
     deviations: Floats | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Coordinates, and what is seen there."""
+
+    place: Floats
+    picture: Singles
+    residuals: Singles
+    loss: float
 
 
 class _Pictures:
@@ -331,27 +341,39 @@ class _Search:
         """One round of finite differences, and the steps that follow from it."""
         state, settings = self.state, self.settings
         before = self._done
-        jacobian = self._jacobian()
-        for _ in range(settings.steps):
+        jacobian, nearby = self._jacobian()
+        for step in range(settings.steps):
             matrix, gradient = normal_equations(self.residuals, jacobian, self.pictures.weights)
             if not self._step(matrix, gradient, jacobian):
+                # Where the quadratic misleads, one of the points that were looked at may still be a better one.
+                if step == 0 and nearby.loss < self.loss:
+                    self._take(nearby)
                 break
         matrix, _ = normal_equations(self.residuals, jacobian, self.pictures.weights)
         state.deviations = self._deviations(matrix)
         state.round += 1
         self._done = before + self._each
 
-    def _jacobian(self) -> Singles:
+    def _jacobian(self) -> tuple[Singles, _Point]:
+        """Derivatives (P, R) at the point, and the best of the points that show them."""
         rows = []
+        best = _Point(self.state.point, self.picture, self.residuals, self.loss)
         for k, name in enumerate(self.space.names):
             ahead = self.state.point.copy()
             ahead[k] += 1.0
             if name == EXPOSURE:
                 moved = self.pictures.residuals(self.picture, self.space.exposure(ahead))
             else:
-                _, moved, _ = self._look(ahead)
+                picture, moved, loss = self._look(ahead)
+                if loss < best.loss:
+                    best = _Point(ahead, picture, moved, loss)
             rows.append(moved - self.residuals)
-        return np.stack(rows)
+        return np.stack(rows), best
+
+    def _take(self, there: _Point) -> None:
+        self.state.point = there.place
+        self.picture, self.residuals, self.loss = there.picture, there.residuals, there.loss
+        self.state.losses.append(there.loss)
 
     def _step(self, matrix: Floats, gradient: Floats, jacobian: Singles) -> bool:
         state, settings = self.state, self.settings
@@ -363,9 +385,7 @@ class _Search:
             # What a step shows is true of it whether it leads down or not.
             broyden_update(jacobian, step, residuals - self.residuals)
             if loss < self.loss:
-                state.point = state.point + step
-                self.picture, self.residuals, self.loss = picture, residuals, loss
-                state.losses.append(loss)
+                self._take(_Point(state.point + step, picture, residuals, loss))
                 state.damping = max(0, damping - 1)
                 return True
         state.damping = len(DAMPINGS) - 1
