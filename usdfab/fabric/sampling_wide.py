@@ -155,7 +155,13 @@ def _yarn(shape: _Shape, system: System, kind: str, floats: int, rng: np.random.
     if plies > 1:
         # Between plies whose fibers lie along the yarn (-twist) and plies that are hardly twisted.
         values["ply_twist"] = -values["twist"] * rng.uniform(0.2, 1.2)
-    return YarnParameters(**values | _fuzz(kind, spacing, rng) | _optics(kind, rng))
+    return YarnParameters(**values | _fuzz(kind, spacing, rng) | _optics(kind, rng) | _uneven(kind, rng))
+
+
+def _uneven(kind: str, rng: np.random.Generator) -> dict:
+    """How thickness and place vary along the yarn: spun yarns do by 10 to 20 %, filament yarns hardly."""
+    most = 0.2 if kind == "filament" else 1.0
+    return {"unevenness": most * rng.uniform(0.03, 0.22), "waviness": most * rng.uniform(0.05, 0.4)}
 
 
 def _fuzz(kind: str, spacing: float, rng: np.random.Generator) -> dict:
