@@ -43,7 +43,9 @@ class LaterStages:
     names:
         In order; empty where the fit ends with the analysis.
     raster, path, match:
-        Settings of the stages; the raster stage's also say how all are judged. None where ``names`` is empty.
+        Settings of the stages. None where ``names`` is empty.
+    judge:
+        How the results of all are judged.
     rig:
         The photo's, where it is known; None leaves it to the stages to find.
     """
@@ -56,6 +58,7 @@ class LaterStages:
     albedo_paths: int = 0
     files: CheckpointFiles | None = None
     rig: Rig | None = None
+    judge: StageSettings | None = None
 
     @classmethod
     def of(
@@ -79,12 +82,12 @@ class LaterStages:
             return cls(())
         from usdfab.fit.match_stage import checked_match_quality
         from usdfab.fit.path_settings import settings_for
-        from usdfab.fit.raster_stage import checked_quality
+        from usdfab.fit.raster_stage import JUDGE, checked_quality
 
         raster = checked_quality(quality)
         # The exposure is found before: the path stage is to leave it as it is.
         path = settings_for(quality, seed=seed, gain=False)  # type: ignore[arg-type]
-        return cls(names, raster, path, checked_match_quality(quality, seed), seed, albedo_paths, files, rig)
+        return cls(names, raster, path, checked_match_quality(quality, seed), seed, albedo_paths, files, rig, JUDGE)
 
     def costs(self) -> dict[str, float]:
         """Seconds that each stage takes, about."""
@@ -150,7 +153,7 @@ class LaterStages:
 
         assert self.path is not None
         own = {"path": replace(self.path, threads=None), "match": self.match}.get(name)
-        return fingerprint(last.fabric, last.halfway, last.exposure, last.rig, self.raster, own)
+        return fingerprint(last.fabric, last.halfway, last.exposure, last.rig, self.raster, self.judge, own)
 
     def _run(
         self,
@@ -161,7 +164,7 @@ class LaterStages:
         analysis: PhotoAnalysis,
         course: Course,
     ) -> tuple[float | None, StageOutcome]:
-        assert self.raster is not None and self.path is not None
+        assert self.raster is not None and self.path is not None and self.judge is not None
         rotation = analysis.rotation
         if name == "network":
             from usdfab.fit.network.stage import run_network
@@ -173,8 +176,9 @@ class LaterStages:
             return last.distance, replace(guess, exposure=last.exposure, rig=last.rig)
         if name == "raster":
             before, after = run_raster(
-                last.fabric, shown, photo, rotation, self.raster, seed=self.seed, exposure=last.exposure,
-                rig=last.rig, albedo_paths=self.albedo_paths, checkpoint=self.files.of(name) if self.files else None,
+                last.fabric, shown, photo, rotation, self.raster, judge=self.judge, seed=self.seed,
+                exposure=last.exposure, rig=last.rig, albedo_paths=self.albedo_paths,
+                checkpoint=self.files.of(name) if self.files else None,
                 resume=True, progress=course.stage(name),
             )  # fmt: skip
             return before.distance, after
@@ -183,14 +187,14 @@ class LaterStages:
 
             assert self.match is not None
             return run_match(
-                last.fabric, photo, rotation, self.match, self.raster, exposure=last.exposure, rig=last.rig,
+                last.fabric, photo, rotation, self.match, self.judge, exposure=last.exposure, rig=last.rig,
                 rig_known=self.rig is not None, distance=last.distance,
                 checkpoint=self.files.of(name) if self.files else None, progress=course.stage(name),
             )  # fmt: skip
         from usdfab.fit.path_run import run_path
 
         return run_path(
-            last.fabric, photo, rotation, self.path, self.raster, halfway=last.halfway, exposure=last.exposure,
+            last.fabric, photo, rotation, self.path, self.judge, halfway=last.halfway, exposure=last.exposure,
             rig=last.rig, distance=last.distance, checkpoint=self.files.of(name) if self.files else None,
             progress=course.stage(name),
         )  # fmt: skip

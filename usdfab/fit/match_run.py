@@ -46,7 +46,7 @@ def run_match(
     photo, rotation:
         (H, W, 3) linear, its whole width ``start.size[0]``; turn of the cloth in it, radians.
     settings, judge:
-        Of the stage, and of the raster stage of the same quality: by its statistics all stages are judged.
+        Of the stage, and how its result is judged (``raster_stage.JUDGE``).
     exposure:
         How many times brighter the photo is than the start under the rig's standard light.
     rig, rig_known:

@@ -174,7 +174,10 @@ class _Pictures:
             shares = np.full(len(upper[0]), 2.0, dtype=np.float32)
             shares[upper[0] == upper[1]] = 1.0
             weights.append(shares / np.float32(statistic[0].numel() * len(target.statistics)))
+        # The mean colour counts as much as all the texture, as in Li et al. 2024, 7.2.
+        weights.append(np.full(3, 1.0 / 3.0, dtype=np.float32))
         self.weights: Singles = np.concatenate(weights)
+        self.mean = target.mean_color.float().reshape(3).numpy()
 
     @staticmethod
     def _upper(statistics: tuple) -> list[tuple[NDArray, NDArray]]:
@@ -194,10 +197,11 @@ class _Pictures:
         return denoise(render.pixels, render.albedo, render.normal)
 
     def residuals(self, picture: Singles, exposure: float) -> Singles:
-        """(R,) differences of the statistics from the target's, each matrix in units of the target's mean entry."""
+        """(R,) differences of the statistics from the target's, each matrix in units of the target's mean entry, and of
+        the mean colours, in units of the mean over the target's channels."""
         import torch
 
-        from usdfab.fit.texture import texture_statistics
+        from usdfab.fit.texture import rolled_off, texture_statistics
 
         target = self.target
         with torch.inference_mode():
@@ -209,6 +213,8 @@ class _Pictures:
             ):
                 difference = ((ours - theirs) / scale)[0].numpy()
                 parts.append(difference[upper] if difference.ndim == 2 else difference)
+            color = rolled_off(image).mean(dim=(0, 2, 3)).numpy() - self.mean
+            parts.append(color / max(float(self.mean.mean()), 1e-3))
         return np.concatenate(parts).astype(np.float32)
 
 

@@ -50,7 +50,7 @@ def run_path(
     photo, rotation:
         (H, W, 3) linear, its whole width ``start.size[0]``; turn of the cloth in it, radians.
     settings, judge:
-        Of the stage, and of the raster stage of the same quality: by its statistics all stages are judged.
+        Of the stage, and how its result is judged (``raster_stage.JUDGE``).
     halfway:
         ``StageOutcome.halfway``: the stage starts from it where its picture is closer to the photo.
     exposure:

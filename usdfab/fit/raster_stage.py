@@ -79,6 +79,10 @@ covariance in the photo is close to nothing, and differences divided by it drown
 """
 
 
+JUDGE = StageSettings(width=240, supersampling=1, levels=(1, 2, 4), kind="gram")
+"""By which all results are judged, whatever their quality: scales from a fifth of a yarn to a few yarns."""
+
+
 @dataclass(frozen=True, eq=False)
 class StageResult:
     """What stage 2 found.
