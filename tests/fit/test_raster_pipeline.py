@@ -79,7 +79,7 @@ def test_the_raster_stage_is_used_only_where_it_comes_closer(
 
 def test_the_traced_distance_is_small_to_itself_and_not_to_another(quick_features: None) -> None:
     net = features.load_features()
-    own = fit_stages.swatch_scene(CLOTH)
+    own = fit_stages.sample_scene(CLOTH)
     picture = fit_stages.Tracer(own).render(own.cameras[0], fit_stages.RenderSettings((40, 40), spp=32, seed=5)).pixels
     other = replace(CLOTH, warp=replace(YARN, albedo=(0.9, 0.2, 0.1)), weft=replace(YARN, radius=1e-4))
     near, far = (fit_stages.traced_distance(f, picture, QUICK, net) for f in (CLOTH, other))
