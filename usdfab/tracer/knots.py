@@ -1,0 +1,121 @@
+"""Which knots of a fiber's spline the tracer keeps, and where straight segments between them lie best.
+
+A fiber is shaded with tangents that are interpolated between those at the ends of a segment. What a picture shows of
+knots that are left out is the error of these tangents far more than that of places: highlights of narrow lobes wander.
+Both are bounded. With ``t`` the tangent and L the length of a segment, both to second order,
+
+    place    L^2 |t'| / 8  <= BEND r          tangent    L^2 |t''| / 8  <= TILT
+
+Chords lie on the inside of a bend, so that a yarn would shrink: vertices are moved outwards by what their segments are
+away on average.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from usdfab.fibers import FiberSystem
+
+BEND = 0.2
+"""How far, in fiber radii, a chord may be from the spline."""
+
+TILT = 0.02
+"""How far, in radians, the shading tangent may be from the spline's.
+
+Measured against all knots, on 8 fibers in each yarn with narrow lobes: bounding places alone, at 0.03 radii, leaves
+tangents 0.04 wrong (root mean square) and direct light 0.15 % too dark with as many segments as this needs for 0.015.
+"""
+
+_FEWEST = 1.0 / 16.0
+"""Least share of a segment that each knot stands for."""
+
+
+def spline_vertices(system: FiberSystem) -> tuple[NDArray, NDArray, NDArray[np.int64]]:
+    """Points and unit tangents of the curves' cubic B-splines at their knots, one vertex before and three after.
+
+    Returns
+    -------
+    points, tangents: (M, 3); offsets: (curves + 1,). Vertex ``1`` of a curve belongs to its first control point.
+    """
+    return knots_of(*system.extended(2, 4))
+
+
+def knots_of(control: NDArray, offsets: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray[np.int64]]:
+    """Points and unit tangents at all knots of cubic B-splines, and the curves' new offsets."""
+    points = (control[:-2] + 4.0 * control[1:-1] + control[2:]) / 6.0
+    tangents = control[2:] - control[:-2]
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    lengths = np.diff(offsets)
+    keep = np.ones(len(control), dtype=bool)
+    keep[offsets[:-1]] = keep[offsets[1:] - 1] = False
+    inner = keep[1:-1]
+    return points[inner], tangents[inner], np.r_[0, np.cumsum(lengths - 2)]
+
+
+def polylines(system: FiberSystem) -> tuple[NDArray, NDArray, NDArray[np.int64]]:
+    """``spline_vertices`` without the knots that straight segments do as well without (``BEND``, ``TILT``).
+
+    The spare vertices before and after each curve stay, so do its ends. Places are moved outwards where knots are left
+    out; tangents are those of the spline.
+    """
+    points, tangents, offsets = spline_vertices(system)
+    keep = _keep(points, tangents, offsets, BEND * system.radius, TILT)
+    kept = np.r_[0, np.cumsum(np.add.reduceat(keep.astype(np.int64), offsets[:-1]))]
+    moved = points[keep] + _outwards(system, points, np.flatnonzero(keep), kept)
+    return moved, tangents[keep], kept
+
+
+def _keep(
+    points: NDArray, tangents: NDArray, offsets: NDArray[np.int64], bend: float, tilt: float
+) -> NDArray[np.bool_]:
+    """(M,) knots to keep: those between which the integral of the root of the errors over their bounds is 1."""
+    length = np.linalg.norm(np.diff(points, axis=0, append=points[-1:]), axis=1)
+    change = np.diff(tangents, axis=0, append=tangents[-1:])
+    turn = np.linalg.norm(change, axis=1)
+    # Second differences of the tangents at both ends of the way to the next knot. Between curves they are wild: there
+    # knots are kept all the same.
+    second = np.r_[0.0, np.linalg.norm(np.diff(change, axis=0), axis=1), 0.0]
+    second = 0.5 * (second[:-1] + second[1:])
+    need = np.sqrt(np.maximum(turn * length / (8.0 * bend), second / (8.0 * tilt)))
+    need = np.clip(need, _FEWEST, 1.0)
+    curve = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+    place = np.arange(len(points)) - offsets[:-1][curve]
+    count = np.diff(offsets)[curve]
+    before = np.cumsum(need) - need
+    start, end = before[offsets[:-1] + 1], before[offsets[1:] - 3]
+    # A whole number of segments on each curve, all equally demanding.
+    whole = np.maximum(np.ceil(end - start - 1e-9), 1.0)
+    number = np.floor((before - start[curve]) * (whole / np.maximum(end - start, 1e-12))[curve] + 1e-6)
+    return (place <= 1) | (place >= count - 3) | (number != np.r_[-1.0, number[:-1]])
+
+
+def _outwards(
+    system: FiberSystem, points: NDArray, kept: NDArray[np.int64], offsets: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """(K, 3) how far the kept knots are to be moved: the mean of how far their two segments are from the spline."""
+    number = len(kept)
+    length = np.linalg.norm(np.diff(points, axis=0, append=points[-1:]), axis=1)
+    arc = np.cumsum(length) - length
+    segment = np.minimum(np.repeat(np.arange(number), np.diff(np.r_[kept, len(points)])), number - 2)
+    first, last = kept[segment], kept[segment + 1]
+    u = ((arc - arc[first]) / np.maximum(arc[last] - arc[first], 1e-300))[:, None]
+    # The trapezoid rule over the knots that were left out; the kept ones lie on their chords.
+    weight = 0.5 * (length + np.r_[0.0, length[:-1]])
+    away = weight[:, None] * (points - (1.0 - u) * points[first] - u * points[last])
+    size = np.diff(arc[kept], append=arc[-1])[:, None]
+    mean = np.add.reduceat(away, kept, axis=0) / np.maximum(size, 1e-300)
+    curve = np.repeat(np.arange(system.curves), np.diff(offsets))
+    place = np.arange(number) - offsets[:-1][curve]
+    # A curve's own segments; where it ends its successor's first one goes on.
+    mean[(place < 1) | (place > np.diff(offsets)[curve] - 4)] = 0.0
+    begin, end = offsets[:-1] + 1, offsets[1:] - 3
+    before = np.r_[np.zeros((1, 3)), mean[:-1]]
+    before[begin] = mean[end[system.predecessor] - 1]
+    after = mean.copy()
+    after[end] = mean[begin[system.successor]]
+    move = 0.5 * (before + after)
+    # Spare vertices go along with the ends, which they prolong.
+    move[offsets[:-1]] = move[begin]
+    move[end + 1] = move[end + 2] = move[end]
+    return move
