@@ -1,4 +1,4 @@
-"""Which knots of a fiber's spline the tracer keeps, and where straight segments between them lie best.
+"""Which knots of a fiber's spline the tracer keeps.
 
 A fiber is shaded with tangents that are interpolated between those at the ends of a segment. What a picture shows of
 knots that are left out is the error of these tangents far more than that of places: highlights of narrow lobes wander.
@@ -6,8 +6,8 @@ Both are bounded. With ``t`` the tangent and L the length of a segment, both to 
 
     place    L^2 |t'| / 8  <= BEND r          tangent    L^2 |t''| / 8  <= TILT
 
-Chords lie on the inside of a bend, so that a yarn would shrink: vertices are moved outwards by what their segments are
-away on average.
+Chords lie on the inside of bends. Moving vertices outwards until they are right on average was tried: it makes direct
+light 0.3 % brighter on plain and 0.16 % on twill.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ BEND = 0.2
 TILT = 0.02
 """How far, in radians, the shading tangent may be from the spline's.
 
-Measured against all knots, on 8 fibers in each yarn with narrow lobes: bounding places alone, at 0.03 radii, leaves
-tangents 0.04 wrong (root mean square) and direct light 0.15 % too dark with as many segments as this needs for 0.015.
+Direct light of a lamp, against all knots: plain +0.30 +- 0.09 %, twill +0.14 +- 0.09 %, satin +0.06 +- 0.06 %, 8 thick
+fibers with narrow lobes -0.01 +- 0.17 %. Places alone bounded by 0.03 radii took twice as many segments there (not on the thick fibers) for
+plain +0.26 %, twill +0.04 %, the thick fibers -0.22 +- 0.43 %.
 """
 
 _FEWEST = 1.0 / 16.0
@@ -56,14 +57,12 @@ def knots_of(control: NDArray, offsets: NDArray[np.int64]) -> tuple[NDArray, NDA
 def polylines(system: FiberSystem) -> tuple[NDArray, NDArray, NDArray[np.int64]]:
     """``spline_vertices`` without the knots that straight segments do as well without (``BEND``, ``TILT``).
 
-    The spare vertices before and after each curve stay, so do its ends. Places are moved outwards where knots are left
-    out; tangents are those of the spline.
+    The spare vertices before and after each curve stay, so do its ends.
     """
     points, tangents, offsets = spline_vertices(system)
     keep = _keep(points, tangents, offsets, BEND * system.radius, TILT)
     kept = np.r_[0, np.cumsum(np.add.reduceat(keep.astype(np.int64), offsets[:-1]))]
-    moved = points[keep] + _outwards(system, points, np.flatnonzero(keep), kept)
-    return moved, tangents[keep], kept
+    return points[keep], tangents[keep], kept
 
 
 def _keep(
@@ -88,34 +87,3 @@ def _keep(
     whole = np.maximum(np.ceil(end - start - 1e-9), 1.0)
     number = np.floor((before - start[curve]) * (whole / np.maximum(end - start, 1e-12))[curve] + 1e-6)
     return (place <= 1) | (place >= count - 3) | (number != np.r_[-1.0, number[:-1]])
-
-
-def _outwards(
-    system: FiberSystem, points: NDArray, kept: NDArray[np.int64], offsets: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """(K, 3) how far the kept knots are to be moved: the mean of how far their two segments are from the spline."""
-    number = len(kept)
-    length = np.linalg.norm(np.diff(points, axis=0, append=points[-1:]), axis=1)
-    arc = np.cumsum(length) - length
-    segment = np.minimum(np.repeat(np.arange(number), np.diff(np.r_[kept, len(points)])), number - 2)
-    first, last = kept[segment], kept[segment + 1]
-    u = ((arc - arc[first]) / np.maximum(arc[last] - arc[first], 1e-300))[:, None]
-    # The trapezoid rule over the knots that were left out; the kept ones lie on their chords.
-    weight = 0.5 * (length + np.r_[0.0, length[:-1]])
-    away = weight[:, None] * (points - (1.0 - u) * points[first] - u * points[last])
-    size = np.diff(arc[kept], append=arc[-1])[:, None]
-    mean = np.add.reduceat(away, kept, axis=0) / np.maximum(size, 1e-300)
-    curve = np.repeat(np.arange(system.curves), np.diff(offsets))
-    place = np.arange(number) - offsets[:-1][curve]
-    # A curve's own segments; where it ends its successor's first one goes on.
-    mean[(place < 1) | (place > np.diff(offsets)[curve] - 4)] = 0.0
-    begin, end = offsets[:-1] + 1, offsets[1:] - 3
-    before = np.r_[np.zeros((1, 3)), mean[:-1]]
-    before[begin] = mean[end[system.predecessor] - 1]
-    after = mean.copy()
-    after[end] = mean[begin[system.successor]]
-    move = 0.5 * (before + after)
-    # Spare vertices go along with the ends, which they prolong.
-    move[offsets[:-1]] = move[begin]
-    move[end + 1] = move[end + 2] = move[end]
-    return move
