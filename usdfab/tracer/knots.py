@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 
 from usdfab.fibers import FiberSystem
 
-BEND = 0.2
+BEND = 0.13
 """How far, in fiber radii, a chord may be from the spline."""
 
-TILT = 0.02
+TILT = 0.013
 """How far, in radians, the shading tangent may be from the spline's.
 
-Direct light of a lamp, against all knots: plain +0.30 +- 0.09 %, twill +0.14 +- 0.09 %, satin +0.06 +- 0.06 %, 8 thick
-fibers with narrow lobes -0.01 +- 0.17 %. Places alone bounded by 0.03 radii took twice as many segments, on the thick
-fibers as many: plain +0.26 %, twill +0.04 %, thick fibers -0.22 +- 0.43 %. All light of a dome, 31 vertices deep: plain
-+0.03 +- 0.23 %, twill +0.13 +- 0.24 %.
+Against all knots, with coarser bounds of 0.2 radii and 0.02: direct light of a lamp on plain +0.30 +- 0.09 %, twill
++0.14 +- 0.09 %, satin +0.06 +- 0.06 %, 8 thick fibers with narrow lobes -0.01 +- 0.17 %; all light of a dome to depth
+31 on plain +0.03 +- 0.23 %, twill +0.13 +- 0.24 %. Places alone, bounded by 0.03 radii, took 1.6 times the segments of
+the present bounds: plain +0.26 %, twill +0.04 %, thick fibers -0.22 +- 0.43 %.
 """
 
 _FEWEST = 1.0 / 16.0
