@@ -84,7 +84,9 @@ def _keep(
     count = np.diff(offsets)[curve]
     before = np.cumsum(need) - need
     start, end = before[offsets[:-1] + 1], before[offsets[1:] - 3]
-    # A whole number of segments on each curve, all equally demanding.
-    whole = np.maximum(np.ceil(end - start - 1e-9), 1.0)
-    number = np.floor((before - start[curve]) * (whole / np.maximum(end - start, 1e-12))[curve] + 1e-6)
-    return (place <= 1) | (place >= count - 3) | (number != np.r_[-1.0, number[:-1]])
+    # Counted from both ends to the middle: variants of a fiber are alike near the tile's border, so are their knots.
+    start, end = start[curve], end[curve]
+    ahead, behind = np.floor(before - start + 1e-6), np.floor(end - before + 1e-6)
+    late = before > 0.5 * (start + end)
+    forward, backward = ahead != np.r_[-1.0, ahead[:-1]], behind != np.r_[behind[1:], -1.0]
+    return (place <= 1) | (place >= count - 3) | np.where(late, backward, forward) | (late != np.r_[False, late[:-1]])
