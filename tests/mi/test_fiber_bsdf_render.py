@@ -20,7 +20,7 @@ from scenes import fabric, swatch
 
 from usdfab.fibers import generate_patch
 from usdfab.mi.fiber_bsdf import register_fiber_bsdf
-from usdfab.tracer import RenderSettings, Tracer, patch_scene
+from usdfab.tracer import RenderSettings, Tracer, knots
 from usdfab.tracer.patch_scene import tile_copies
 
 SIDE = 16
@@ -68,5 +68,5 @@ def test_mean_of_satin_with_narrow_lobes(tmp_path, monkeypatch):
 
     With all knots of the splines: without those that the tracer leaves out these few thick fibers are 1.3 % darker.
     """
-    monkeypatch.setattr(patch_scene, "BEND", 1e-9)
+    monkeypatch.setattr(knots, "BEND", 1e-9)
     compare(fabric("satin", fibers=8, roughness_azimuthal=0.1), 64, 65536, 0.006, tmp_path)

@@ -8,7 +8,7 @@ from scenes import dome, fabric, swatch
 
 from usdfab.errors import UsdfabError
 from usdfab.fibers import generate_patch
-from usdfab.tracer import RenderSettings, Tracer, patch_scene, render as render_module
+from usdfab.tracer import RenderSettings, Tracer, knots, render as render_module
 from usdfab.tracer.patch_scene import build_patch_scene
 from usdfab.tracer.reference import reference_fibers, render_reference, trace
 from usdfab.usd.scene import DistantLight, RectLight, SphereLight
@@ -36,7 +36,7 @@ def test_fast_equals_reference(name, depth, spp, monkeypatch):
 @pytest.mark.parametrize(("name", "depth", "spp"), CASES)
 def test_fast_equals_reference_closely(name, depth, spp, monkeypatch):
     """On the same segments: with all knots of the splines, of which the tracer otherwise leaves some out."""
-    monkeypatch.setattr(patch_scene, "BEND", 1e-9)
+    monkeypatch.setattr(knots, "BEND", 1e-9)
     check(name, depth, 16 * spp, 24, monkeypatch)
 
 
@@ -48,8 +48,8 @@ def test_knots_that_are_left_out_are_hardly_missed(vertices, monkeypatch):
     scene, camera = swatch(CLOTH, zoom=0.3)
     settings = RenderSettings((24, 24), spp=16384, max_depth=2)
     renders = []
-    for bend in (1e-9, patch_scene.BEND):
-        monkeypatch.setattr(patch_scene, "BEND", bend)
+    for bend in (1e-9, knots.BEND):
+        monkeypatch.setattr(knots, "BEND", bend)
         monkeypatch.setattr(render_module, "build_tiles", lambda cloth: [build_patch_scene(cloth, patch)])
         renders.append(Tracer(scene).render(camera, settings))
     exact, usual = renders

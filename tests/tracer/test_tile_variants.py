@@ -91,7 +91,7 @@ def test_no_seams(axis):
 
 def test_brightness_and_coverage_stay():
     """On average over fabrics: each is one draw of the same irregular cloth, or four."""
-    settings = RenderSettings((40, 40), spp=24, max_depth=32)
+    settings = RenderSettings((40, 40), spp=64, max_depth=32)
     light, cover = [], []
     for seed in range(4):
         pictures = [

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
 
 from cyclopts import App, CycloptsError
 
 from usdfab._version import __version__
+from usdfab.cli.quick_start import collect_rarely, leave
 from usdfab.errors import UsdfabError
 
 USAGE_ERROR, INTERRUPTED = 2, 130
@@ -68,13 +68,10 @@ def make_app(chosen: str = "") -> App:
     return app
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main() -> None:
     """Run the command line and end the process with its exit code."""
-    # The Numba cache must be writable also where the package is not.
-    code = _run(list(sys.argv[1:] if arguments is None else arguments))
-    sys.stdout.flush()
-    sys.stderr.flush()
-    raise SystemExit(code)
+    collect_rarely()
+    leave(_run(sys.argv[1:]))
 
 
 def _run(arguments: list[str]) -> int:

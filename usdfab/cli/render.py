@@ -104,6 +104,11 @@ def run(
     stage:
         A USD file.
     """
+    from usdfab.cli.quick_start import load_numba
+
+    if backend == "embree":
+        load_numba()
+
     from usdfab.cli.picture import picture_options
     from usdfab.cli.render_files import RenderFile, plan_files
     from usdfab.cli.scene_source import SceneSource, frame_numbers

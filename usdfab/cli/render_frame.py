@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import Executor
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 from usdfab.cli.cluster import ExecutorRunner
 from usdfab.cli.options import Region, progress_bar, say
 from usdfab.cli.picture import PictureOptions, render_facts, render_line, write_picture
+from usdfab.cli.preview import Preview
 from usdfab.cli.render_files import RenderFile
 from usdfab.cli.scene_source import SceneSource, read_textures, scene_fingerprint
 from usdfab.errors import UsdfabError
@@ -87,7 +88,7 @@ def _render(
     warn: Any,
 ) -> Facts:
     print_of_scene = scene_fingerprint(scene, textures)
-    with _runner(source, scene, textures, print_of_scene, shot, settings, remote) as (runner, segments, said):
+    with _runner(source, scene, textures, print_of_scene, shot, settings, remote) as (runner, segments, said, tracer):
         for warning in said:
             warn(warning)
         identity = Identity.of(print_of_scene, shot, settings, segments)
@@ -99,8 +100,8 @@ def _render(
             file.partial.unlink(missing_ok=True)  # --overwrite: it is not to be taken for this one
         autosave = Autosave(file.partial, identity, settings.spp, partial(warn, always=True), before)
         try:
-            announce = nullcontext() if options.quiet else announce_compilation(say)
-            with announce, progress_bar(options.label, quiet=options.quiet) as update:
+            shown = Preview(file, tracer, shot, options.picture, quiet=options.quiet)
+            with shown, announce_compilation(shown.show), progress_bar(options.label, quiet=options.quiet) as update:
                 seconds = before + accumulate(
                     work,
                     runner,
@@ -132,16 +133,16 @@ def _render(
 @contextmanager
 def _runner(
     source: SceneSource, scene: Scene, textures: dict, wanted: str, shot: Shot, settings: RenderSettings, remote: Remote
-) -> Iterator[tuple[Runner, int, tuple[str, ...]]]:
-    """Who samples tiles, how many fiber segments the scene has, and the tracer's warnings."""
+) -> Iterator[tuple[Runner, int, tuple[str, ...], Tracer | None]]:
+    """Who samples tiles, how many fiber segments the scene has, the tracer's warnings, and the tracer if it is here."""
     if remote is not None:
         executor, slots = remote
         elsewhere = ExecutorRunner(executor, slots, source, wanted, shot)
-        yield elsewhere, *elsewhere.about()
+        yield elsewhere, *elsewhere.about(), None
         return
     tracer = Tracer(scene, textures, source.strict)
     with ThreadRunner(partial(tracer.sample, shot), settings.threads or 1) as here:
-        yield here, tracer.segments, tracer.warnings
+        yield here, tracer.segments, tracer.warnings, tracer
 
 
 def _write(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtri
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
@@ -40,4 +39,6 @@ def uniform(*keys: ArrayLike) -> NDArray[np.float64]:
 
 def normal(*keys: ArrayLike) -> NDArray[np.float64]:
     """N(0, 1) for broadcast integer keys."""
+    from scipy.special import ndtri  # here: a stage without fabrics is rendered before SciPy would be loaded
+
     return ndtri(uniform(*keys))

@@ -162,6 +162,14 @@ def function_addresses() -> tuple[int, int]:
     )
 
 
+@_once
+def packet_address() -> int:
+    """Address of ``rtcIntersect16`` (valid, scene, rays and hits, arguments)."""
+    address = ctypes.cast(library().rtcIntersect16, ctypes.c_void_p).value
+    assert address is not None
+    return address
+
+
 class EmbreeScene:
     """A committed Embree scene. Keeps its buffers alive; freed with the object.
 

@@ -1,7 +1,7 @@
 """A fiber patch as an Embree scene: everything that overlaps one tile, so that the tile can repeat for ever.
 
 Curves are the cubic B-splines that the expanded USD asset and Mitsuba draw. Embree gets them as round linear segments
-whose vertices lie on the spline, with the spline's tangent kept at each vertex, so that the shading frame is smooth.
+between some of the spline's knots (``knots.py``), with its tangent at each vertex, so that the shading frame is smooth.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from usdfab.fibers.tiles import tile_copies
 from usdfab.scattering.fiber_numba import pack_fiber
 from usdfab.scattering.roughness import absorption_from_albedo
 from usdfab.tracer.embree import NEIGHBOR_LEFT, NEIGHBOR_RIGHT, EmbreeScene, curve_scene
+from usdfab.tracer.knots import knots_of, polylines
 
 FIBER_RADIUS_UNITS = 0.1
 """Radius of the thinnest fiber in patch space. Embree's curve intersector has thresholds that are not relative: in
@@ -28,12 +29,6 @@ metres, with fibers of 1e-5, it returns wrong places along the segment."""
 
 DARKEST = 1e-4
 """Least fiber albedo coefficient: 0 would be infinitely absorbing."""
-
-BEND = 0.03
-"""How far, in fiber radii, a straight segment may be from the spline: knots in between are left out. The shading frame
-is the spline's own all the same. Five times as much would save half of the segments and no time, but shows where cloth
-is compared with the splines themselves.
-"""
 
 
 @dataclass(frozen=True)
@@ -147,50 +142,6 @@ def fiber_parameters(
     )
 
 
-def spline_vertices(system: FiberSystem) -> tuple[NDArray, NDArray, NDArray[np.int64]]:
-    """Points and unit tangents of the curves' cubic B-splines at their knots, one vertex before and three after.
-
-    Returns
-    -------
-    points, tangents: (M, 3); offsets: (curves + 1,). Vertex ``1`` of a curve belongs to its first control point.
-    """
-    return _spline_vertices(*system.extended(2, 4))
-
-
-def _spline_vertices(control: NDArray, offsets: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray[np.int64]]:
-    """Points and unit tangents at all knots of cubic B-splines, and the curves' new offsets."""
-    points = (control[:-2] + 4.0 * control[1:-1] + control[2:]) / 6.0
-    tangents = control[2:] - control[:-2]
-    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    lengths = np.diff(offsets)
-    keep = np.ones(len(control), dtype=bool)
-    keep[offsets[:-1]] = keep[offsets[1:] - 1] = False
-    inner = keep[1:-1]
-    return points[inner], tangents[inner], np.r_[0, np.cumsum(lengths - 2)]
-
-
-def _sparse(system: FiberSystem) -> tuple[NDArray, NDArray, NDArray[np.int64]]:
-    """``spline_vertices`` without the knots that a straight segment does as well without (``BEND``).
-
-    The spare vertices before and after each curve stay, so do its ends. Knots are chosen so that the integral of
-    sqrt(curvature / 8 BEND r) between them is 1: a chord of length L over a bend of curvature k is L^2 k / 8 away.
-    """
-    points, tangents, offsets = spline_vertices(system)
-    length = np.linalg.norm(np.diff(points, axis=0, append=points[-1:]), axis=1)
-    turn = np.linalg.norm(np.diff(tangents, axis=0, append=tangents[-1:]), axis=1)
-    need = np.clip(np.sqrt(turn * length / (8.0 * BEND * system.radius)), 1.0 / 16.0, 1.0)
-    curve = np.repeat(np.arange(system.curves), np.diff(offsets))
-    place = np.arange(len(points)) - offsets[:-1][curve]
-    count = np.diff(offsets)[curve]
-    before = np.cumsum(need) - need
-    start, end = before[offsets[:-1] + 1], before[offsets[1:] - 3]
-    # A whole number of segments on each curve, all equally demanding.
-    whole = np.maximum(np.ceil(end - start - 1e-9), 1.0)
-    number = np.floor((before - start[curve]) * (whole / np.maximum(end - start, 1e-12))[curve] + 1e-6)
-    keep = (place <= 1) | (place >= count - 3) | (number != np.r_[-1.0, number[:-1]])
-    return points[keep], tangents[keep], np.r_[0, np.cumsum(np.add.reduceat(keep.astype(np.int64), offsets[:-1]))]
-
-
 def _tile_segments(
     system: FiberSystem | OpenCurves, size: tuple[float, float]
 ) -> tuple[NDArray, NDArray, NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]:
@@ -201,9 +152,7 @@ def _tile_segments(
 
     Returns vertices (V, 3), tangents (V, 3), first vertex (S,), neighbour flags (S,) and curve (S,).
     """
-    points, tangents, offsets = (
-        _spline_vertices(*system.pinned()) if isinstance(system, OpenCurves) else _sparse(system)
-    )
+    points, tangents, offsets = knots_of(*system.pinned()) if isinstance(system, OpenCurves) else polylines(system)
     curve_of_vertex = np.repeat(np.arange(system.curves), np.diff(offsets))
     place = np.arange(len(points)) - offsets[:-1][curve_of_vertex]
     lengths = np.diff(offsets)[curve_of_vertex]

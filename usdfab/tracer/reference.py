@@ -35,7 +35,7 @@ from usdfab.scattering.fiber_numba import (
     prepare_fiber,
     sample_fiber,
 )
-from usdfab.tracer.patch_scene import spline_vertices
+from usdfab.tracer.knots import spline_vertices
 from usdfab.usd.scene import Camera, DistantLight, DomeLight, Light, PointLight, RectLight
 
 _EPSILON = 5e-3
