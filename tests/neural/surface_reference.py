@@ -9,8 +9,8 @@ import numpy as np
 from usdfab.neural.surface_material import SurfaceMaterial
 from usdfab.scattering import surface_model as model
 
-STEP, REACH = 1 / 32, 5.0
-"""Step and length of shadow rays, in cells."""
+START, STEP, REACH = 1 / 64, 1 / 32, 5.0
+"""Begin, step and length of shadow rays, in cells."""
 
 
 def segment_at(material: SurfaceMaterial, row: int, column: int) -> tuple[bool, float, int]:
@@ -93,7 +93,7 @@ class Surface:
         start, across = self.height(points), math.hypot(w[0], w[1])
         if across < 1e-9:
             return open_
-        for reach in np.arange(1.0 / 16, REACH, STEP):
+        for reach in np.arange(START, REACH, STEP):
             there = points + reach / across * w[:2]
             open_ &= start + reach / across * w[2] >= self.height(there)
         return open_

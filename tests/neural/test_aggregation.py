@@ -52,8 +52,8 @@ def test_it_agrees_with_the_reference(weave: str, below: bool) -> None:
     slow = np.array([aggregate_slowly(m, row, below) for row in rows])
     scale = slow.max(axis=0)
     assert slow[:, :4].max() > 0.05 and slow[:, 4].max() > 0.05
-    # The reference's own noise is 1 to 3 % of each; horizons between texels show a little too much of the gaps.
-    assert np.all(np.abs(fast - slow)[:, :4] <= 0.04 * scale[:4] + 0.03 * slow[:, :4])
+    # Sampling noise of both is 1 %; horizons between texels show a little too much of the gaps.
+    assert np.all(np.abs(fast - slow)[:, :4] <= 0.03 * scale[:4] + 0.02 * slow[:, :4])
     assert np.abs(fast - slow)[:, 4].max() < 0.025
     assert fast[:, :4].mean(axis=0) == pytest.approx(slow[:, :4].mean(axis=0), rel=0.03)
 
