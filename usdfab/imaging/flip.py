@@ -55,7 +55,7 @@ def flip_map(test: ArrayLike, reference: ArrayLike, pixels_per_degree: float = P
         _hunt(_lab(_seen(np.stack([_filtered(o[..., c], filters[c]) for c in range(3)], axis=-1)))) for o in opponents
     ]
     color = _color_error(_hyab(colors[0], colors[1]))
-    feature = _feature_error(*((o[..., 0] + 16.0) / 116.0 for o in opponents), pixels_per_degree)
+    feature = _feature_error(_lightness(opponents[0]), _lightness(opponents[1]), pixels_per_degree)
     return color ** (1.0 - feature)
 
 
@@ -70,9 +70,14 @@ def _opponent(linear: Floats) -> Floats:
     return np.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], axis=-1)
 
 
+def _lightness(opponent: Floats) -> Floats:
+    """Y of 0 to 1."""
+    return (opponent[..., 0] + 16.0) / 116.0
+
+
 def _seen(opponent: Floats) -> Floats:
     """Back to linear RGB, clipped."""
-    y = (opponent[..., 0] + 16.0) / 116.0
+    y = _lightness(opponent)
     xyz = np.stack([y + opponent[..., 1] / 500.0, y, y - opponent[..., 2] / 200.0], axis=-1) * _WHITE
     return np.clip(xyz @ _FROM_XYZ.T, 0.0, 1.0)
 
