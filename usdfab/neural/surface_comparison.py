@@ -40,6 +40,10 @@ FABRICS = {"plain": "linen", "twill": "denim", "satin": "silk-satin"}
 
 IRAWAN, JIN, FIBERS = "irawan_marschner_2012", "jin_2022", "fibers"
 VIEWS = ("close", "distant")
+
+CELLS_PER_PIXEL = 6.0
+"""Of the distant view: a pixel sees more than the repeat of any of the weaves, and no moire appears."""
+
 PICTURE, NUMBERS = "surface.png", "surface.json"
 
 
@@ -53,6 +57,10 @@ class Scale:
     samples: int = 256
     threads: int | None = None
     seed: int = 0
+
+
+SCALES = {"draft": Scale(96, 80, 32), "standard": Scale(240, 160, 256), "paper": Scale(512, 384, 1024)}
+"""By the names of ``--quality``."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +112,7 @@ def _of_fabric(fabric: FabricParameters, scale: Scale) -> dict[tuple[str, str], 
     width = scale.close
     height = max(1, round(width * fabric.size[1] / fabric.size[0]))
     close = swatch_view(fabric, rig_for(fabric.size), (width, height))
-    cylinder = Cylinder(fabric)
+    cylinder = Cylinder(fabric, CELLS_PER_PIXEL * scale.distant)
     distant = cylinder.view(scale.distant)
     traced = {
         "close": _traced(swatch_scene(fabric), (width, height), scale),
