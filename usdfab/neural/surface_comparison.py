@@ -83,10 +83,9 @@ class Comparison:
     rows: list[Difference]
 
 
-def compare_surfaces(
-    scale: Scale, progress: Progress | None = None, weaves: Sequence[str] = tuple(FABRICS)
-) -> Comparison:
-    """All weaves, views and models."""
+def compare_surfaces(scale: Scale, progress: Progress | None = None, weaves: Sequence[str] | None = None) -> Comparison:
+    """All weaves of ``FABRICS``, or some; both views, all models."""
+    weaves = tuple(FABRICS) if weaves is None else weaves
     pictures: dict[tuple[str, str, str], Floats] = {}
     rows: list[Difference] = []
     for index, weave in enumerate(weaves):
