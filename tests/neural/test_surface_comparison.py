@@ -60,7 +60,8 @@ def test_a_swatch_pixel_sees_what_the_tracer_sees_there() -> None:
     # The lamp stands at +x: light comes from there, and from straight above at its foot.
     assert np.all(view.queries[:, 3] > 0) and np.all(view.queries[:, 5] > 0.9)
     assert np.max(view.light) / math.pi == pytest.approx(1.0, abs=0.1)
-    behind = swatch_view(fabric, rig_for(fabric.size), (24, 24), behind=True)
+    rig = rig_for(fabric.size)
+    behind = swatch_view(fabric, rig, (24, 24), np.array(rig.light_position) * [1, 1, -1])
     assert np.allclose(behind.queries[:, 3:6], view.queries[:, 3:6] * [1, 1, -1])
 
 

@@ -1,8 +1,8 @@
 """Figure 11 of Li et al. 2024: two surface models beside the fibers, close up and at a distance.
 
-Both surface models get the geometry of ``surface_from_fabric`` and diffuse albedos fitted to the fibers' close-up, so
-that mean colours agree there; everything else, and all of the distant view, is prediction. The fibers are path traced
-(and denoised where the denoiser is installed).
+Both surface models get the geometry of ``surface_from_fabric`` and albedos fitted to small renders of the fibers under
+three lamps (``surface_albedos``), so that mean colours agree there; where highlights lie, and all of the distant view,
+is prediction. The fibers are path traced (and denoised where the denoiser is installed).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from usdfab.imaging import denoise, flip, grid, mse, write_image
 from usdfab.neural.aggregation import aggregate
 from usdfab.neural.cylinder import Cylinder
 from usdfab.neural.irawan import irawan_components
-from usdfab.neural.surface_albedos import fitted
+from usdfab.neural.surface_albedos import fit_reflection, observe
 from usdfab.neural.surface_from_fabric import SurfaceAlbedos, surface_from_fabric
 from usdfab.neural.surface_material import SurfaceMaterial
 from usdfab.neural.surface_swatch import View, swatch_view
@@ -118,11 +118,9 @@ def _of_fabric(fabric: FabricParameters, scale: Scale) -> dict[tuple[str, str], 
         "distant": _traced(cylinder.scene(), (scale.distant, scale.distant), scale),
     }
     found: dict[tuple[str, str], Floats] = {}
+    lamps = observe(fabric, seed=scale.seed + 1, threads=scale.threads)
     for model in (IRAWAN, JIN):
-        seen = traced["close"].reshape(-1, 3) / close.light[:, None]
-        parts = _components(model, material, close, scale)
-        matrix = albedos.reflection.copy()
-        matrix[:2] = fitted(parts, seen, matrix[2:])
+        matrix = fit_reflection(lambda view, model=model: _components(model, material, view, scale), lamps)  # type: ignore[misc]
         colors = SurfaceAlbedos(matrix, albedos.transmission)
         for name, view in (("close", close), ("distant", distant)):
             found[name, model] = _shown(model, material, colors, view, scale)
