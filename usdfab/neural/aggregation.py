@@ -29,7 +29,8 @@ and 0.01 to 0.04; up to 0.2 passes the gaps. So k_d of both sides together must 
 Against exact heights and finely marched shadows components are within 1 % on the mean; the visible share of gaps is up
 to 0.02 too large.
 
-Cost: 6 to 10 million samples a second on a thread, and up to 1.5 s once for a new geometry (8 x 8), ``tests/benchmarks/bench_aggregation.py``.
+Cost: 6 to 10 million samples a second on a thread, and up to 1.5 s once for a new geometry (8 x 8 crossings);
+``tests/benchmarks/bench_aggregation.py``.
 """
 
 from __future__ import annotations
