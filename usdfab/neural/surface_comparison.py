@@ -150,10 +150,18 @@ def _components(model: str, material: SurfaceMaterial, view: View, scale: Scale)
 def _traced(scene: Scene, resolution: tuple[int, int], scale: Scale) -> Floats:
     settings = RenderSettings(resolution, spp=scale.spp, seed=scale.seed, threads=scale.threads)
     render: Render = Tracer(scene).render(scene.cameras[0], settings)
-    pixels = render.pixels
-    if find_spec("mitsuba_oidn") is not None:
-        pixels = denoise(pixels, render.albedo, render.normal)
-    return pixels.astype(np.float64)
+    if find_spec("mitsuba_oidn") is None:
+        return render.pixels.astype(np.float64)
+    return with_mean(denoise(render.pixels, render.albedo, render.normal), render.pixels)
+
+
+def with_mean(pixels: NDArray[np.float32], unbiased: NDArray[np.float32]) -> Floats:
+    """``pixels`` (H, W, 3) scaled, each channel by itself, to the mean of ``unbiased``.
+
+    The denoiser takes rare bright samples for errors and drops them, and with them a good part of pale cloth's light.
+    """
+    have, want = (np.asarray(p, dtype=np.float64).mean(axis=(0, 1)) for p in (pixels, unbiased))
+    return np.asarray(pixels, dtype=np.float64) * np.where(have > 0, want / np.maximum(have, 1e-12), 1.0)
 
 
 def planned_files(folder: Path, *, overwrite: bool) -> tuple[Path, Path]:
