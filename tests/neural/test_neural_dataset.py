@@ -18,7 +18,14 @@ from scipy import stats
 from usdfab.cli.main import _run
 from usdfab.errors import UsdfabError
 from usdfab.neural.aggregation import aggregate
-from usdfab.neural.dataset_draws import PAPER_WEAVES, DatasetSettings, draw_material, draw_queries, make_targets
+from usdfab.neural.dataset_draws import (
+    PAPER_WEAVES,
+    DatasetSettings,
+    draw_material,
+    draw_queries,
+    make_targets,
+    settings_of,
+)
 from usdfab.neural.dataset_reader import list_materials, material_metadata, material_of, read_manifest, read_material
 from usdfab.neural.dataset_store import MaterialStore, make_material, produce_materials
 
@@ -103,6 +110,16 @@ def test_other_settings_are_refused(whole: Path, capsys: pytest.CaptureFixture[s
     assert "the data set here is another one (seed 0, not 1)" in capsys.readouterr().err
     assert command(whole.parent, "--materials", 3) == 2
     assert "holds other things" in capsys.readouterr().err
+
+
+def test_a_damaged_manifest_is_named() -> None:
+    good = SMALL.manifest(3)
+    assert settings_of(good, "here") == SMALL
+    for change, said in (({"gap": 0.2}, "damaged"), ({"schema": "usdfab-neural-dataset/9"}, "format")):
+        with pytest.raises(UsdfabError, match=f"here: .*{said}"):
+            settings_of(good | change, "here")
+    with pytest.raises(UsdfabError, match="here: the manifest has no gap"):
+        settings_of({name: value for name, value in good.items() if name != "gap"}, "here")
 
 
 def test_draws_have_the_papers_distributions() -> None:

@@ -130,7 +130,10 @@ def settings_of(manifest: dict[str, Any], place: str) -> DatasetSettings:
     except KeyError as error:
         raise UsdfabError(f"the manifest has no {error.args[0]}", place=place) from error
     given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    return DatasetSettings(**given)
+    try:
+        return DatasetSettings(**given)
+    except TypeError as error:
+        raise UsdfabError("the manifest is damaged", place=place, remedy="restore it from a copy") from error
 
 
 def draw_material(settings: DatasetSettings, index: int) -> SurfaceMaterial:
