@@ -63,12 +63,13 @@ def run(
     checked_output(output, (".safetensors",), overwrite=overwrite, kind="weights")
     require_fit_extra("train")
     from usdfab.fit.features import fast_dtype
-    from usdfab.fit.network.curves import write_curves
     from usdfab.fit.network.fit import DEFAULT_EPOCHS, fit_network
     from usdfab.fit.network.inputs import feature_net
     from usdfab.fit.network.network_file import save_network
     from usdfab.fit.network.store import draw_inputs, prepare
-    from usdfab.fit.network.training import TrainSettings, checked_device
+    from usdfab.fit.network.training import TrainSettings
+    from usdfab.imaging.curves import write_curves
+    from usdfab.torch_run import checked_device
 
     settings = TrainSettings(model, DEFAULT_EPOCHS[model] if epochs is None else epochs, seed)
     where = checked_device(device)
