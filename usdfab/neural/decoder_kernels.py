@@ -95,21 +95,12 @@ def _lean_inputs(x, found, code, queries, start, count):
             fx, fy = np.float32(px - left), np.float32(py - low)
             c0, r0 = int(left) & (side - 1), int(low) & (side - 1)
             c1, r1 = (c0 + 1) & (side - 1), (r0 + 1) & (side - 1)
-            t00, t01, t10, t11 = (
-                first + r0 * side + c0,
-                first + r0 * side + c1,
-                first + r1 * side + c0,
-                first + r1 * side + c1,
-            )
+            a, b = first + r0 * side, first + r1 * side
             gx, gy = np.float32(1.0) - fx, np.float32(1.0) - fy
-            s00, s01, s10, s11 = share * gx * gy, share * fx * gy, share * gx * fy, share * fx * fy
+            s0, s1, s2, s3 = share * gx * gy, share * fx * gy, share * gx * fy, share * fx * fy
             for channel in range(FEATURES):
-                found[channel] += (
-                    s00 * code[t00, channel]
-                    + s01 * code[t01, channel]
-                    + s10 * code[t10, channel]
-                    + s11 * code[t11, channel]
-                )
+                low_pair = s0 * code[a + c0, channel] + s1 * code[a + c1, channel]
+                found[channel] += low_pair + s2 * code[b + c0, channel] + s3 * code[b + c1, channel]
         for channel in range(FEATURES):
             x[channel, k] = found[channel]
     for k in range(count):

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from usdfab.errors import UsdfabError
+from usdfab.neural.dataset_reader import Kind, list_materials, read_material
 from usdfab.neural.network import PIXELS
 from usdfab.neural.surface_material import SurfaceMaterial
-from usdfab.neural.surface_tile import SurfaceTile, surface_tile
+from usdfab.neural.surface_tile import surface_tile
 
 HELD_OUT = 0.1
 """Part of the materials that has no part in training."""
@@ -63,19 +64,14 @@ class Examples:
         return found.hexdigest()
 
 
-def tile_image(tile: SurfaceTile) -> Tensor:
-    """What encoders take, (6, P, P): the tile's normal and orientation."""
-    return torch.from_numpy(np.concatenate([tile.normal, tile.orientation], axis=-1)).permute(2, 0, 1).float()
-
-
 def material_inputs(materials: Sequence[SurfaceMaterial]) -> tuple[Tensor, Tensor]:
     """What encoders take of materials: tiles (M, 6, P, P), and roughness and height scale (M, 2)."""
-    tiles = torch.stack([tile_image(surface_tile(material, PIXELS)) for material in materials])
+    tiles = torch.from_numpy(np.stack([surface_tile(material, PIXELS).channels() for material in materials]))
     return tiles, torch.tensor([[m.roughness, m.height_scale] for m in materials], dtype=torch.float32)
 
 
 def load_examples(
-    folder: Path, kind: str, most: int | None = None, progress: Callable[[int, int], None] | None = None
+    folder: Path, kind: Kind, most: int | None = None, progress: Callable[[int, int], None] | None = None
 ) -> Examples:
     """All materials of a data set; ``most`` queries of each.
 
@@ -86,8 +82,6 @@ def load_examples(
     UsdfabError
         If there is no data set, it holds no material of the kind, or a file is damaged.
     """
-    from usdfab.neural.dataset_reader import list_materials, read_material
-
     paths = list_materials(folder, kind)
     if not paths:
         raise UsdfabError(

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from usdfab.neural.encoding import angles
-from usdfab.neural.network import CHANNELS, SLOPE, MaterialNetwork
+from usdfab.neural.network import SLOPE, MaterialNetwork
 
 FEATURES = 16
 """Of each texel."""
@@ -26,6 +26,10 @@ SIDES = (32, 16, 8, 4, 2, 1)
 FIRST_TEXEL = (0, 1024, 1280, 1344, 1360, 1364)
 TEXELS = 1365
 ANGLES = 8
+_IMAGES = 12
+"""Of the encoder's input: normal, normal with the height scale, and the products of the orientation with itself, in
+which a fiber has no sign and which may be averaged. Four pixels are taken together, and both parameters added."""
+
 LEVEL_BIAS = 1.0
 """Levels finer than the one whose texels are as large as the footprint, so that neighbours overlap."""
 
@@ -51,8 +55,7 @@ class LeanNetwork(MaterialNetwork):
     def __init__(self, kind: str, width: int = 32, channels: int = 32) -> None:
         super().__init__(kind)
         self.width, self.channels = width, channels
-        # The tile, the normals with the height scale, four pixels at a time, and both parameters.
-        self.stem = conv(4 * (CHANNELS + 3) + 2, channels)
+        self.stem = conv(4 * _IMAGES + 2, channels)
         self.fine = nn.ModuleList(conv(channels, channels) for _ in range(2))
         self.down = nn.ModuleList(conv(channels, channels) for _ in SIDES[1:])
         self.up = nn.ModuleList(nn.Conv2d(channels, channels, 1) for _ in SIDES[1:])
@@ -68,10 +71,11 @@ class LeanNetwork(MaterialNetwork):
 
     def encode(self, tiles: Tensor, parameters: Tensor) -> Tensor:
         """Pyramids (M, TEXELS, FEATURES): down to one texel for context, up again for detail."""
-        beta = parameters[:, 1, None, None, None]
-        scaled = torch.cat([tiles[:, :2] * beta, tiles[:, 2:3]], dim=1)
+        normal, fiber = tiles[:, :3], tiles[:, 3:]
+        scaled = torch.cat([normal[:, :2] * parameters[:, 1, None, None, None], normal[:, 2:]], dim=1)
         scaled = scaled / scaled.norm(dim=1, keepdim=True).clamp(min=1e-6)
-        x = F.pixel_unshuffle(torch.cat([tiles, scaled], dim=1), 2)
+        products = fiber[:, [0, 1, 2, 0, 0, 1]] * fiber[:, [0, 1, 2, 1, 2, 2]]
+        x = F.pixel_unshuffle(torch.cat([normal, scaled, products], dim=1), 2)
         plane = parameters[:, :, None, None].expand(-1, -1, *x.shape[2:])
         x = F.leaky_relu(self.stem(torch.cat([x, plane], dim=1)), SLOPE)
         for layer in self.fine:

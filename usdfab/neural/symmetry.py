@@ -25,6 +25,10 @@ def transformed_tile(tile: Tensor, number: int, shift: tuple[int, int] = (0, 0))
     tile = tile * sign[:, None, None]
     if number & 4:
         tile = tile.transpose(-1, -2)[..., [1, 0, 2, 4, 3, 5], :, :]
+    normal, fiber = tile.split(3, dim=-3)
+    # A fiber has no direction of its own: as ``surface_tile`` has it, wefts point to the right and warps upwards.
+    along = torch.where(fiber[..., 0, :, :].abs() > fiber[..., 1, :, :].abs(), fiber[..., 0, :, :], fiber[..., 1, :, :])
+    tile = torch.cat([normal, torch.where(along[..., None, :, :] < 0.0, -fiber, fiber)], dim=-3)
     return tile.roll((shift[1], shift[0]), (-2, -1))
 
 
