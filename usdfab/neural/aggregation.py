@@ -7,8 +7,8 @@ Chen et al. 2024 (paper B), eq. 3 to 8, by quasi Monte Carlo. For a footprint P,
     f_P = kd_warp C_warp + kd_weft C_weft + ks_warp S_warp + ks_weft S_weft
 
 Settled here, where the paper is silent:
-- The kernel k_P is a box: ``size`` tiles wide in u and in v, around the centre. Its colour in a picture is the mean over
-  that square. For a weave whose repeat is not square the footprint is stretched with the tile.
+- The kernel k_P is a box: ``size`` tiles wide in u and in v, around the centre. For a weave whose repeat is not square
+  the footprint is stretched with the tile.
 - The cosine is *included*, as in eq. 3: light of radiance L from a solid angle dw adds ``f_P L dw``; a directional
   light of irradiance E across its own direction adds ``f_P E``. Nothing is to be multiplied by <wi.n_s> again.
 - The specular term's cosines are those with n_p: with eq. 3 it becomes D G / (4 <n_s.n_p>), which is bounded.
@@ -40,8 +40,8 @@ from usdfab.neural.surface_material import SurfaceMaterial
 from usdfab.neural.surface_tile import packed_geometry
 from usdfab.scattering.surface_model import DIFFUSE_BLEND
 
-TEXELS, AZIMUTHS = 16, 64
-"""Resolution of the horizons: texels along a cell, directions around."""
+TEXELS, AZIMUTHS, FINER = 32, 32, 3
+"""Resolution of the horizons: texels along a cell, directions around; how much finer their heights are."""
 
 COMPONENTS = ("C_warp", "C_weft", "S_warp", "S_weft")
 """The columns of what ``aggregate`` returns."""
@@ -142,10 +142,11 @@ def checked_queries(queries: ArrayLike) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=16)
-def _horizons(bits: str, inclination_warp: float, inclination_weft: float, gap: float) -> NDArray[np.float32]:
+def _horizons(bits: str, inclination_warp: float, inclination_weft: float, gap: float) -> NDArray[np.uint8]:
     """Horizons for beta = 1; they scale with beta, and neither twist nor roughness change them."""
     from usdfab.neural.surface_material import weave_from_bits
 
     plain = SurfaceMaterial(weave_from_bits(bits), inclination=(inclination_warp, inclination_weft), gap=gap)
     cells, yarns = packed_geometry(plain)
-    return tile_horizons(tile_heights(cells, yarns, plain.half_width, TEXELS), TEXELS, AZIMUTHS)
+    heights = tile_heights(cells, yarns, plain.half_width, FINER * TEXELS)
+    return tile_horizons(heights, FINER, TEXELS, AZIMUTHS)

@@ -32,29 +32,30 @@ def aggregate_queries(
         side = -1.0 if transmission else 1.0
         cloth = abs(wiz)
 
-        # Horizons: the azimuth is the same for all samples; below elevation tan / beta the sky is hidden.
-        i_low, i_high, i_blend, i_tan = _direction(wix, wiy, cloth, beta, azimuths)
-        o_low, o_high, o_blend, o_tan = _direction(wox, woy, woz, beta, azimuths)
+        # Horizons: the azimuth is the same for all samples; heights scale with beta, so its sky is that at tan / beta.
+        i_low, i_high, i_blend, i_level = _direction(wix, wiy, cloth, beta, azimuths)
+        o_low, o_high, o_blend, o_level = _direction(wox, woy, woz, beta, azimuths)
 
         stream = mix(mix(seed + np.uint64(0x9E3779B97F4A7C15)) + np.uint64(k))
         shift_x = np.float64(stream >> np.uint64(40)) * 2.0**-24
         shift_y = np.float64((stream >> np.uint64(8)) & np.uint64(0xFFFFFF)) * 2.0**-24
         size = queries[k, 2]
         left, bottom = queries[k, 0] - 0.5 * size, queries[k, 1] - 0.5 * size
+        tiles = math.floor(size)
 
         area = gaps = c_warp = c_weft = s_warp = s_weft = 0.0
         for n in range(samples):
             x = shift_x + n * _R2_X
             y = shift_y + n * _R2_Y
-            x = left + size * (x - math.floor(x))
-            y = bottom + size * (y - math.floor(y))
+            x = left + _within(size * (x - math.floor(x)), tiles)
+            y = bottom + _within(size * (y - math.floor(y)), tiles)
             x = min((x - math.floor(x)) * columns, columns * (1.0 - 1e-12))
             y = min((y - math.floor(y)) * rows, rows * (1.0 - 1e-12))
             system, nx, ny, nz, tx, ty, tz = frame_at(x, y, cells, yarns, half_width, beta)
 
             # A(p, wo), eq. 4
             co = wox * nx + woy * ny + woz * nz
-            if co <= 0.0 or hidden(horizons, o_low, o_high, o_blend, x * texels, y * texels, o_tan):
+            if co <= 0.0 or hidden(horizons, o_low, o_high, o_blend, x * texels, y * texels, o_level):
                 continue
             own = co / nz
             area += own
@@ -62,7 +63,7 @@ def aggregate_queries(
                 gaps += own
                 continue
             ci = side * (wix * nx + wiy * ny + wiz * nz)
-            if not lit or ci <= 0.0 or hidden(horizons, i_low, i_high, i_blend, x * texels, y * texels, i_tan):
+            if not lit or ci <= 0.0 or hidden(horizons, i_low, i_high, i_blend, x * texels, y * texels, i_level):
                 continue
 
             # f_p <wi.n_p> of eq. 3, without albedo; the specular term's cosines cancel against those of A.
@@ -86,10 +87,20 @@ def aggregate_queries(
 
 
 @njit(cache=True, error_model="numpy", inline="always")
+def _within(place, tiles):
+    """Where the footprint is ``tiles`` or more wide, its whole tiles are one tile, gone through once by all samples.
+
+    A sequence that went through many of them would be thinned out to a worse one.
+    """
+    return place / tiles if place < tiles else place - tiles
+
+
+@njit(cache=True, error_model="numpy", inline="always")
 def _direction(x, y, z, beta, azimuths):
-    """Two neighbouring azimuths, the place between them, and the elevation's tangent over beta."""
+    """Two neighbouring azimuths, the place between them, and the elevation as ``hidden`` takes it."""
     across = math.sqrt(x * x + y * y)
     turn = math.atan2(y, x) / (2.0 * math.pi) * azimuths
     turn = turn + azimuths if turn < 0.0 else turn
     low = int(turn) % azimuths
-    return low, (low + 1) % azimuths, turn - math.floor(turn), z / max(across * beta, 1e-12)
+    tangent = z / max(across * beta, 1e-12)
+    return low, (low + 1) % azimuths, turn - math.floor(turn), 255.0 * tangent / (1.0 + tangent)

@@ -124,54 +124,63 @@ def bilinear(image, x, y):
     """``image`` (H, W), periodic, between its texel centres; x in [0, W), y in [0, H)."""
     height, width = image.shape
     fx, fy = x - 0.5, y - 0.5
-    c0, r0 = int(math.floor(fx)), int(math.floor(fy))
+    c0, r0 = math.floor(fx), math.floor(fy)
     fx, fy = fx - c0, fy - r0
     c0 = c0 + width if c0 < 0 else c0
     r0 = r0 + height if r0 < 0 else r0
     c1 = c0 + 1 if c0 + 1 < width else 0
     r1 = r0 + 1 if r0 + 1 < height else 0
-    low = image[r0, c0] + fx * (image[r0, c1] - image[r0, c0])
-    high = image[r1, c0] + fx * (image[r1, c1] - image[r1, c0])
+    # As floats: differences of bytes would wrap.
+    a, b, c, d = float(image[r0, c0]), float(image[r0, c1]), float(image[r1, c0]), float(image[r1, c1])
+    low = a + fx * (b - a)
+    high = c + fx * (d - c)
     return low + fy * (high - low)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def tile_horizons(heights, texels, azimuths):
-    """(azimuths, H, W) float32: tangent of the elevation below which the tile hides the sky, for beta = 1, at least 0.
+def tile_horizons(heights, finer, texels, azimuths):
+    """(azimuths, H, W) uint8, 255 t / (1 + t): the tile hides the sky below an elevation of tangent t, for beta = 1.
 
-    Azimuth k is the direction (cos, sin)(2 pi k / azimuths) in (x, y). Marches in steps of one texel until nothing of
-    the tile can stand higher.
+    One byte keeps t to 0.004 (1 + t)^2 and the tables in the processor's cache.
+
+    ``heights`` (finer H, finer W) has ``finer texels`` a cell, an odd multiple, so that each texel's centre is one of
+    its own. Azimuth k is the direction (cos, sin)(2 pi k / azimuths) in (x, y). Marches in steps of half a texel,
+    of 6 % of the way farther out, until nothing of the tile can stand higher.
     """
-    height, width = heights.shape
-    horizons = np.zeros((azimuths, height, width), dtype=np.float32)
+    height, width = heights.shape[0] // finer, heights.shape[1] // finer
+    horizons = np.zeros((azimuths, height, width), dtype=np.uint8)
     top = heights.max()
+    step = 0.5 * finer
+    wide, high = float(heights.shape[1]), float(heights.shape[0])
+    over_w, over_h = 1.0 / wide, 1.0 / high
     for k in prange(azimuths):
         angle = 2.0 * math.pi * k / azimuths
         dx, dy = math.cos(angle), math.sin(angle)
         for r in range(height):
             for c in range(width):
-                base = heights[r, c]
+                base = heights[r * finer + finer // 2, c * finer + finer // 2]
                 most = 0.0
-                x, y = c + 0.5, r + 0.5
-                reach = 1.0
+                x, y = (c + 0.5) * finer, (r + 0.5) * finer
+                reach = step
                 # Beyond this distance not even the highest crest rises above what hides the sky already.
-                while (top - base) * texels > max(most, 0.01) * reach:
-                    px = (x + reach * dx) % width
-                    py = (y + reach * dy) % height
-                    px = px if px < width else 0.0
-                    py = py if py < height else 0.0
-                    slope = (bilinear(heights, px, py) - base) * texels / reach
+                while (top - base) * texels * finer > max(most, 0.02) * reach:
+                    # A remainder would cost more than the look-up.
+                    px = (x + reach * dx) * over_w
+                    py = (y + reach * dy) * over_h
+                    px = min((px - math.floor(px)) * wide, wide - 1e-6)
+                    py = min((py - math.floor(py)) * high, high - 1e-6)
+                    slope = (bilinear(heights, px, py) - base) * texels * finer / reach
                     most = max(most, slope)
-                    reach += 1.0
-                horizons[k, r, c] = most
+                    reach += max(step, 0.06 * reach)
+                horizons[k, r, c] = int(255.0 * most / (1.0 + most) + 0.5)
     return horizons
 
 
 @njit(**_OPTIONS)
-def hidden(horizons, low, high, blend, x, y, tangent):
-    """Whether the tile hides the sky at elevation ``tangent`` from texel position (x, y).
+def hidden(horizons, low, high, blend, x, y, level):
+    """Whether the tile hides the sky at elevation ``level`` (255 t / (1 + t)) from texel position (x, y).
 
     Between the azimuths ``low`` and ``high``.
     """
     here = bilinear(horizons[low], x, y)
-    return here + blend * (bilinear(horizons[high], x, y) - here) > tangent
+    return here + blend * (bilinear(horizons[high], x, y) - here) > level

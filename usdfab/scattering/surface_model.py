@@ -11,8 +11,8 @@ Notation
     wi, wo   unit directions towards light and viewer, pointing away from the surface
     n_p      normal of the yarn's surface at the point;  n_s  normal of the cloth
     t        unit fiber direction at the point, orthogonal to n_p
-    cos      |w.n_p|. Settled: the cosines of the specular term and of Lambda are those with n_p, as in SpongeCake, whose
-             layer has one normal. The value is then bounded after the cosines of eq. 3 have cancelled.
+    cos      |w.n_p|. Settled: the cosines of the specular term and of Lambda are those with n_p, as in SpongeCake,
+             whose layer has one normal. The value is then bounded after the cosines of eq. 3 have cancelled.
     alpha    roughness of the flakes around the fiber direction: 1 is isotropic, small is a fiber
     S        I - (1 - alpha^2) t t^T, that is diag(1, 1, alpha^2) turned to t (SGGX of a fiber, Heitz et al. 2015)
     T rho    ``OPTICAL_DEPTH``: thickness times density of the layer, 2 for fabrics
