@@ -1,19 +1,29 @@
-"""``usdfab dataset``: rendered fabrics with their parameters, to train networks on."""
+"""``usdfab dataset``: rendered fabrics and surface materials with their parameters, to train networks on."""
 
 from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
-from cyclopts import Parameter
+from cyclopts import App, Parameter
 
 from usdfab.cli.options import Json, Overwrite, Quiet, Seed, parse_tile, print_json, progress_bar, say
 
+HELP = """Make data sets that networks learn from.
 
-def run(
-    what: Literal["fabrics"],
-    /,
+Usage examples:
+
+    usdfab dataset fabrics -o fabrics --count 5000
+    usdfab dataset neural -o materials --materials 60 --kind both
+"""
+
+run = App(name="dataset", help=HELP, help_format="markdown")
+run.command("usdfab.cli.dataset_neural:neural", name="neural")
+
+
+@run.command
+def fabrics(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"], help="Folder of the data set, new or to go on with.")],
     count: Annotated[int, Parameter(help="Samples to have in the end, from --start on.")] = 1000,
@@ -50,11 +60,6 @@ def run(
         usdfab dataset fabrics -o wide --prior wide --count 64 --size 128 --picture sheet.png
         usdfab dataset fabrics -o fabrics --count 5000 --part 2/8 --workers 16
         usdfab dataset fabrics -o fabrics --count 5000 --scheduler tcp://farm:8786
-
-    Parameters
-    ----------
-    what:
-        fabrics: swatches under the capture rig.
     """
     from usdfab.errors import UsdfabError
     from usdfab.files import checked_output

@@ -43,6 +43,9 @@ from usdfab.scattering.surface_model import DIFFUSE_BLEND
 TEXELS, AZIMUTHS, FINER = 32, 32, 3
 """Resolution of the horizons: texels along a cell, directions around; how much finer their heights are."""
 
+_POOL = numba.get_num_threads()
+"""Numba's threads; more cannot be asked for."""
+
 COMPONENTS = ("C_warp", "C_weft", "S_warp", "S_weft")
 """The columns of what ``aggregate`` returns."""
 
@@ -112,7 +115,7 @@ def _run(
     horizons = _horizons(material.bits(), *material.inclination, material.gap)
     out = np.zeros((len(rows), 5), dtype=np.float32)
     before = numba.get_num_threads()
-    numba.set_num_threads(min(threads or before, numba.config.NUMBA_NUM_THREADS))
+    numba.set_num_threads(min(threads or before, _POOL))
     try:
         aggregate_queries(
             rows, cells, yarns, material.half_width, material.height_scale, material.roughness, horizons, TEXELS,

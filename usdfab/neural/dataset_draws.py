@@ -129,7 +129,8 @@ def settings_of(manifest: dict[str, Any], place: str) -> DatasetSettings:
         values = {f.name: manifest[f.name] for f in fields(DatasetSettings)}
     except KeyError as error:
         raise UsdfabError(f"the manifest has no {error.args[0]}", place=place) from error
-    return DatasetSettings(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    return DatasetSettings(**given)
 
 
 def draw_material(settings: DatasetSettings, index: int) -> SurfaceMaterial:

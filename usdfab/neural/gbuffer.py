@@ -30,8 +30,8 @@ TAGS = 6
 POSITION, FACE, FRAME, PLACE, SIZE, VIEW, TINT, UV, HIT, DEPTH = 0, 3, 6, 15, 17, 18, 21, 24, 26, 28
 NUMBERS = 29
 """Columns of the numbers: position (3), the triangle's normal on the viewer's side (3), frame x, y, z (9), u and v of
-the footprint in tiles, its side in tiles, direction to the viewer in the frame (3; of other surfaces in the world), factor of the albedo (3), texture
-coordinates (2), barycentric coordinates (2), distance."""
+the footprint in tiles, its side in tiles, direction to the viewer (3; of cloth in its frame, else in the world), factor
+of the albedo (3), texture coordinates (2), barycentric coordinates (2), distance."""
 
 LEAST_COSINE = 0.02
 """Of the view with the cloth: grazing rays are taken as this steep."""

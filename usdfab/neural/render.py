@@ -51,7 +51,7 @@ def render(
     threads: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> NeuralRender:
-    """What a camera sees; the same on any number of threads. The lens is a pinhole and the shutter opens for no time."""
+    """What a camera sees; the same on any number of threads. A pinhole, and the shutter opens for no time."""
     began = time.perf_counter()
     view = pack_view(camera, *size, False)
     x0, y0, x1, y1 = region

@@ -11,7 +11,6 @@ that it was rendering and nothing else.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import io
 import json
@@ -27,9 +26,7 @@ from typing import Any
 from usdfab.errors import UsdfabError
 from usdfab.files import whole_file
 from usdfab.fit.dataset.settings import INFORMATIVE, Settings, settings_of
-
-if os.name == "posix":
-    import fcntl
+from usdfab.production import claimed, disk_refused, name_first, write_whole
 
 MANIFEST, LOOSE, SHARDS, CLAIMS = "dataset.json", "loose", "shards", "claims"
 
@@ -108,26 +105,8 @@ class Store:
         Where the system knows no file locks every claim is granted: two processes may then make a sample twice, which
         costs time and nothing else.
         """
-        if os.name != "posix":
-            yield not self.is_finished(index)
-            return
-        path = self.root / CLAIMS / sample_name(index)
-        try:
-            lock = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
-        except OSError as error:
-            raise _refused(error, path) from error
-        try:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                # Others than "somebody has it" mean a file system without locks.
-                yield error.errno not in (errno.EWOULDBLOCK, errno.EACCES) and not self.is_finished(index)
-                return
-            # Whoever had the lock before may have finished and taken the file's name away.
-            yield not self.is_finished(index)
-            path.unlink(missing_ok=True)
-        finally:
-            os.close(lock)
+        with claimed(self.root / CLAIMS / sample_name(index), lambda: self.is_finished(index)) as mine:
+            yield mine
 
     def commit(self, index: int, record: dict[str, Any], image: bytes) -> None:
         """Keep a finished sample; packs its shard if that is full now.
@@ -139,10 +118,10 @@ class Store:
         """
         target = self._record_path(index)
         try:
-            _write(target.with_suffix(".exr"), image)
-            _write(target, encode_record(record))
+            write_whole(target.with_suffix(".exr"), image)
+            write_whole(target, encode_record(record))
         except OSError as error:
-            raise _refused(error, target) from error
+            raise disk_refused(error, target) from error
         self.pack(index // self.settings.shard)
 
     def pack(self, shard: int) -> bool:
@@ -163,7 +142,7 @@ class Store:
                 if not target.exists():
                     raise
             except OSError as error:
-                raise _refused(error, target) from error
+                raise disk_refused(error, target) from error
         for path in records:
             path.unlink(missing_ok=True)
             path.with_suffix(".exr").unlink(missing_ok=True)
@@ -197,7 +176,7 @@ class Store:
             for name in (LOOSE, SHARDS, CLAIMS):
                 (self.root / name).mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise _refused(error, self.root) from error
+            raise disk_refused(error, self.root) from error
 
     def _check_manifest(self) -> None:
         path, wanted = self.root / MANIFEST, self.settings.manifest()
@@ -205,9 +184,9 @@ class Store:
             temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}.json")
             try:
                 temporary.write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
-                _first(temporary, path)
+                name_first(temporary, path)
             except OSError as error:
-                raise _refused(error, path) from error
+                raise disk_refused(error, path) from error
             finally:
                 temporary.unlink(missing_ok=True)
         found = read_manifest(self.root)
@@ -271,30 +250,3 @@ def check_image(record: bytes, image: bytes, place: str) -> dict[str, Any]:
 
 
 _AGAIN = "remove it and run `usdfab dataset` again"
-
-
-def _write(target: Path, content: bytes) -> None:
-    with whole_file(target) as temporary, temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _first(temporary: Path, target: Path) -> None:
-    """Give a file its name unless somebody was faster."""
-    try:
-        os.link(temporary, target)
-    except FileExistsError:
-        pass
-    except OSError:  # a file system without hard links
-        if not target.exists():
-            temporary.replace(target)
-
-
-def _refused(error: OSError, path: Path) -> UsdfabError:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return UsdfabError(
-            "the disk is full", place=str(path),
-            remedy="make room and run the same command again; finished samples are kept",
-        )  # fmt: skip
-    return UsdfabError(f"cannot be written ({error.strerror or error})", place=str(path))
