@@ -197,7 +197,9 @@ def _check_backend(
         return next((name for name, value in options.items() if value is not None and value is not False), None)
 
     if backend not in ("embree", "mitsuba", "neural"):
-        raise UsdfabError(f"there is no '{backend}'", place="--backend", remedy="choose embree or mitsuba, or neural to be quick")
+        raise UsdfabError(
+            f"there is no '{backend}'", place="--backend", remedy="choose embree or mitsuba, or neural to be quick"
+        )
     if backend != "embree" and (wrong := given(embree)):
         name = "Mitsuba" if backend == "mitsuba" else backend
         raise UsdfabError(f"the {name} backend has no such option", place=wrong, remedy="use --backend embree")

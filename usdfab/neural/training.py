@@ -35,7 +35,7 @@ SGD_DROPS, SGD_FACTOR = (0.5, 0.8), 0.2
 
 WEIGHT_DECAY = 1e-4
 WARM_UP = 100
-"""Steps over which Adam's rate rises."""
+"""Steps over which Adam's rate rises, or a tenth of all."""
 
 Progress = Callable[[int, int, str], None]
 
@@ -211,7 +211,7 @@ def _factor(settings: TrainSettings, step: int, steps: int) -> float:
     """Of the learning rate."""
     if settings.optimizer == "sgd":
         return SGD_FACTOR ** sum(step >= part * steps for part in SGD_DROPS)
-    return min(1.0, (step + 1) / WARM_UP) * 0.5 * (1.0 + math.cos(math.pi * step / steps))
+    return min(1.0, (step + 1) / min(WARM_UP, 1 + steps // 10)) * 0.5 * (1.0 + math.cos(math.pi * step / steps))
 
 
 def _batches(
