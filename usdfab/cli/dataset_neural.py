@@ -36,7 +36,9 @@ def neural(
         1.0,
     ),
     large: Annotated[Two, Parameter(negative_iterable=(), help="Those of the other half.")] = (1.0, 5.0),
-    gap: Annotated[float, Parameter(help="Part of a cell's width that yarns leave open.")] = 0.2,
+    gap: Annotated[
+        Two, Parameter(negative_iterable=(), help="Part of a cell's width that yarns leave open, from and to.")
+    ] = (0.2, 0.2),
     seed: Seed = 0,
     workers: Annotated[int | None, Parameter(help="Processes, one thread each; as many as cores by default.")] = None,
     json: Json = False,

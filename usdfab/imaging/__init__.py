@@ -6,6 +6,7 @@ from usdfab.imaging.color import (
     srgb_to_linear as srgb_to_linear,
 )
 from usdfab.imaging.denoise import check_denoiser as check_denoiser, denoise as denoise
+from usdfab.imaging.flip import flip as flip, flip_map as flip_map
 from usdfab.imaging.image_file import Image as Image, read_image as read_image, read_layers as read_layers
 from usdfab.imaging.image_output import encoded as encoded, write_image as write_image
 from usdfab.imaging.layout import grid as grid, side_by_side as side_by_side

@@ -58,7 +58,7 @@ class DatasetSettings:
     small, large:
         Footprint sizes in tiles: uniform in either, half of the queries each.
     gap:
-        Of all materials.
+        Uniform; the paper's is always 0.2.
     """
 
     kind: str = "reflection"
@@ -72,7 +72,7 @@ class DatasetSettings:
     height_scale: Range = (0.0, 2.0)
     small: Range = (0.0, 1.0)
     large: Range = (1.0, 5.0)
-    gap: float = PAPER_GAP
+    gap: Range = (PAPER_GAP, PAPER_GAP)
 
     def __post_init__(self) -> None:
         if self.kind not in (*KINDS, "both"):
@@ -93,7 +93,7 @@ class DatasetSettings:
             ("inclination", self.inclination, degrees["inclination"]),
             ("roughness", self.roughness, ROUGHNESS_RANGE),
             ("height-scale", self.height_scale, HEIGHT_SCALE_RANGE),
-            ("gap", (self.gap,), GAP_RANGE),
+            ("gap", self.gap, GAP_RANGE),
             ("small", self.small, (0.0, 1e3)),
             ("large", self.large, (0.0, 1e3)),
         ):
@@ -101,7 +101,7 @@ class DatasetSettings:
             if outside:
                 told = f"{outside[0]:g} is not between {limits[0]:g} and {limits[1]:g}"
                 raise UsdfabError(told, place=f"--{name}")
-            if name not in ("twist", "gap") and (len(values) != 2 or values[0] > values[1]):
+            if name != "twist" and (len(values) != 2 or values[0] > values[1]):
                 raise UsdfabError("expected two numbers, the lower first", place=f"--{name}")
 
     @property
@@ -145,7 +145,7 @@ def draw_material(settings: DatasetSettings, index: int) -> SurfaceMaterial:
         (float(inclination[0]), float(inclination[1])),
         float(rng.uniform(*settings.roughness)),
         float(rng.uniform(*settings.height_scale)),
-        settings.gap,
+        float(rng.uniform(*settings.gap)),
         weave.name,
     )
 
