@@ -19,6 +19,7 @@ class NeuralOptions:
     architecture: str
     kind: str
     hold_out_weaves: int
+    initial: Path | None
     curves: Path | None
     resume: bool
     device: str
@@ -46,6 +47,7 @@ def neural(
         Literal["adam", "sgd"], Parameter(help="adam, or sgd with the rates of Chen et al. 2024.")
     ] = "adam",
     hold_out_weaves: Annotated[int, Parameter(help="Whole weaves that judge instead of being learned.")] = 1,
+    initial: Annotated[Path | None, Parameter(help="Weights of the same architecture to begin with.")] = None,
     curves: Annotated[Path | None, Parameter(help="Folder for pictures of the losses.")] = None,
     resume: Annotated[bool, Parameter(negative="", help="Go on from the state that an interrupted run left.")] = False,
     device: Annotated[str, Parameter(help="cpu or cuda.")] = "cpu",
@@ -74,7 +76,9 @@ def neural(
     from usdfab.files import checked_output
     from usdfab.neural.extra import require_neural_extra
 
-    options = NeuralOptions(architecture, kind, hold_out_weaves, curves, resume, device, overwrite, json, quiet)
+    options = NeuralOptions(
+        architecture, kind, hold_out_weaves, initial, curves, resume, device, overwrite, json, quiet
+    )
     architectures = ["lean", "paper"] if architecture == "both" else [architecture]
     kinds = ["reflection", "transmission"] if kind == "both" else [kind]
     files = {(a, k): _file(output, a, k, options) for a in architectures for k in kinds}
@@ -123,11 +127,17 @@ def _train(dataset: Path, file: Path, settings: Any, options: NeuralOptions) -> 
     from usdfab._version import __version__
     from usdfab.imaging.curves import write_curves
     from usdfab.neural.examples import load_examples, split
-    from usdfab.neural.material_file import Weights, rounded, save_material_network
+    from usdfab.neural.material_file import Weights, load_material_network, rounded, save_material_network
     from usdfab.neural.measures import table
     from usdfab.neural.network import parameter_count
     from usdfab.neural.training import train
 
+    network = None
+    if options.initial is not None:
+        network = load_material_network(options.initial, settings.kind).network
+        if network.architecture != settings.architecture:
+            said = f"the weights are of the architecture {network.architecture}, not {settings.architecture}"
+            raise UsdfabError(said, place=str(options.initial), remedy="give --architecture")
     state = file.with_name(f"{file.stem}.training.safetensors")
     with progress_bar(f"reading {settings.kind}", quiet=options.quiet) as update:
         examples = load_examples(dataset, settings.kind, progress=update)
@@ -135,7 +145,7 @@ def _train(dataset: Path, file: Path, settings: Any, options: NeuralOptions) -> 
     label = f"training {settings.architecture}, {settings.kind}"
     with progress_bar(label, quiet=options.quiet) as update:
         found = train(
-            data, settings, device=options.device, checkpoint=state, resume=options.resume,
+            data, settings, device=options.device, network=network, checkpoint=state, resume=options.resume,
             progress=lambda done, total, text: update(done, total, f"{label}: {text}"),
         )  # fmt: skip
     if found.interrupted:

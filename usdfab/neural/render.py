@@ -104,7 +104,7 @@ def shade_band(
             for number in np.unique(group[group >= 0]):
                 those = np.flatnonzero(group == number)
                 found = scene.plans[number].decode(queries[those])
-                albedo = scene.albedo[number // 4]
+                albedo = scene.albedo[number // 4, number % 2]
                 # A print colours what goes through fibers, not what they mirror.
                 value = numbers[those, TINT : TINT + 3] * (found[:, :2] @ albedo[:2]) + found[:, 2:] @ albedo[2:]
                 radiance[those] += weights[those] * value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -12,7 +13,7 @@ from usdfab.errors import UsdfabError
 from usdfab.neural.decoder import Plan, plans_of
 from usdfab.neural.material_file import Weights
 from usdfab.neural.surface_from_fabric import surface_from_fabric
-from usdfab.neural.surface_material import SurfaceMaterial
+from usdfab.neural.surface_material import PAPER_GAP, SurfaceMaterial
 from usdfab.tracer import embree
 from usdfab.tracer.embree import EmbreeScene
 from usdfab.tracer.intrinsics import filter_address
@@ -25,6 +26,8 @@ from usdfab.usd.scene import DistantLight, DomeLight, Light, PointLight, Scene, 
 
 LARGEST_REPEAT = 16
 """Most ends or picks in a tile: beyond, a yarn is less than four pixels wide in what the encoder sees."""
+
+LARGEST_TWIST = math.radians(30.0)
 
 DOME_PLACES, AREA_PLACES = 16, 4
 """Directions of a dome, places on a light with an extent: of each sample."""
@@ -49,8 +52,8 @@ class NeuralScene:
     ----------
     plans: 4 to each fabric
         Front lit from the front, from behind; back lit from its own front, from behind.
-    albedo: (fabrics, 4, 3)
-        Of C_warp, C_weft, S_warp, S_weft.
+    albedo: (fabrics, 2, 4, 3)
+        Of C_warp, C_weft, S_warp, S_weft, for light from the front and from behind.
     mips, repeats:
         See ``gbuffer.fill``.
     embree:
@@ -70,6 +73,16 @@ class NeuralScene:
 def reversed_material(material: SurfaceMaterial) -> SurfaceMaterial:
     """The cloth turned about its warp: what was below is on top, left is right; a twist stays what it is."""
     return replace(material, weave=~material.weave[:, ::-1])
+
+
+def learned_material(material: SurfaceMaterial) -> tuple[SurfaceMaterial, float]:
+    """A material among those that networks are trained on, and by how much more of the cloth its yarns should cover.
+
+    Networks know one gap and twists up to 30 degrees (Table 2 of Chen et al. 2024).
+    """
+    twist = tuple(float(np.clip(t, -LARGEST_TWIST, LARGEST_TWIST)) for t in material.twist)
+    known = replace(material, twist=(twist[0], twist[1]), gap=PAPER_GAP)
+    return known, (1.0 - material.gap) / (1.0 - PAPER_GAP)
 
 
 def build(
@@ -105,16 +118,17 @@ def build(
             left_out("a surface that glows lights nothing in the neural backend", material.path)
     _check_uv(scene)
     materials = []
-    albedo = np.zeros((len(scene.fabrics), 4, 3))
+    albedo = np.zeros((len(scene.fabrics), 2, 4, 3))
     for number, surface in enumerate(scene.fabrics):
         material, colors = surface_from_fabric(surface.fabric)
+        material, cover = learned_material(material)
         if max(material.rows, material.columns) > LARGEST_REPEAT:
             raise UsdfabError(
                 f"a weave of {material.columns} ends and {material.rows} picks is larger than the encoder takes "
                 f"({LARGEST_REPEAT})", place=surface.path, remedy="use --backend embree",
             )  # fmt: skip
         materials += [material, reversed_material(material)]
-        albedo[number] = colors
+        albedo[number] = cover * np.stack([colors.reflection, colors.transmission])
     plans: list[Plan] = []
     if materials:
         both = [plans_of(networks[kind].network, materials) for kind in ("reflection", "transmission")]
