@@ -41,8 +41,9 @@ def whole(material: SurfaceMaterial, rows: np.ndarray, transmission: bool = Fals
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("weave", ["plain", "twill_3x3", "satin_5x10"])
-@pytest.mark.parametrize("below", [False, True])
+@pytest.mark.parametrize(
+    "weave,below", [("plain", False), ("twill_3x3", True), ("satin_5x10", False), ("satin_5x10", True)]
+)
 def test_it_agrees_with_the_reference(weave: str, below: bool) -> None:
     """Another sampling, exact heights and finely marched shadows give the same four numbers."""
     m = material(weave)
@@ -164,7 +165,7 @@ def test_gaps_let_light_through() -> None:
 def test_a_white_cloth_reflects_no_more_than_it_gets() -> None:
     """Over all light, from every view: the specular part of white flakes alone, and the Lambert part alone, below 1."""
     rng = np.random.default_rng(0)
-    count = 4000
+    count = 1500
     wi = directions(count, rng)
     wiz = np.sqrt(1 - np.sum(wi**2, axis=1))
     # The disk is drawn uniformly within radius^2 0.95; f_P has the cosine in it, which the density has as well.
@@ -177,7 +178,8 @@ def test_a_white_cloth_reflects_no_more_than_it_gets() -> None:
             through = aggregate(m, rows_below, transmission=True, samples=128) / wiz[:, None]
             total = (light + through).mean(axis=0) * math.pi * 0.95
             assert 0.05 < total[2:].sum() < 1.0
-            assert light[:, :2].mean(axis=0).sum() * math.pi * 0.95 < 1.0
+            diffuse = light[:, :2].mean(axis=0).sum() * math.pi * 0.95
+            assert 0.3 < diffuse < 1.0 - 0.9 * delta_transmission(m, rows[:1], samples=4096)[0]
 
 
 def test_it_does_not_depend_on_threads_and_does_on_the_seed() -> None:

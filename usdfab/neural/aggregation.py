@@ -22,7 +22,15 @@ Settled here, where the paper is silent:
   ``delta_transmission``, not in the four components (paper B leaves it out).
 - Nothing visible in the footprint (A_P = 0): all components are 0.
 
-Cost: about ten million samples a second on a thread, ``tests/benchmarks/bench_aggregation.py``.
+Energy, measured over all light for plain and satin, alpha 0.1 to 1, beta 0 to 2, views from 0 to 65 degrees: a white
+cloth (k = 1) reflects 0.45 to 0.9 diffusely and 0.08 to 0.26 specularly, and lets through, lit from below, 0.34 to 0.85
+and 0.01 to 0.04; up to 0.2 passes the gaps. So k_d of both sides together must stay near 1, which nothing enforces.
+
+Against exact heights and finely marched shadows components are within 1 % on the mean; the visible share of gaps is up
+to 0.02 too large.
+
+Cost: 6 to 10 million samples a second on a thread, and up to 1.5 s once for a new geometry (8 x 8 crossings);
+``tests/benchmarks/bench_aggregation.py``.
 """
 
 from __future__ import annotations

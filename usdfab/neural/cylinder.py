@@ -33,7 +33,7 @@ class Cylinder:
     """Cloth of ``cells`` warp yarns across the cylinder's width, as many high as wide."""
 
     fabric: FabricParameters
-    cells: float = 120.0
+    cells: float = 500.0
 
     @property
     def radius(self) -> float:

@@ -41,7 +41,8 @@ def irawan_components(
 ) -> NDArray[np.float32]:
     """(Q, 4) C_warp, C_weft, S_warp, S_weft with the cosine of wi included; arguments as ``aggregation.aggregate``.
 
-    Roughness becomes the highlight's width; height scale and gap play no part.
+    Roughness is the highlight's width, as an angle of the half vector like the microflakes'; height scale and gap play
+    no part.
     """
     rows = checked_queries(queries)
     return _components(material, rows, samples, seed) * np.array([1, 1, *[_normalisation(material)] * 2], np.float32)
@@ -50,7 +51,7 @@ def irawan_components(
 def _components(material: SurfaceMaterial, rows: NDArray[np.float64], samples: int, seed: int) -> NDArray[np.float32]:
     cells, yarns = packed_geometry(material)
     out = np.zeros((len(rows), 4), dtype=np.float32)
-    width = max(0.5 * material.roughness, LEAST_WIDTH)
+    width = max(material.roughness, LEAST_WIDTH)
     _aggregate(rows, cells, yarns, width, UNIFORM, FORWARD, _bessel(FORWARD), samples, np.uint64(seed), out)
     return out
 

@@ -1,8 +1,8 @@
 """Figure 11 of Li et al. 2024: two surface models beside the fibers, close up and at a distance.
 
-Both surface models get the geometry of ``surface_from_fabric`` and diffuse albedos fitted to the fibers' close-up, so
-that mean colours agree there; everything else, and all of the distant view, is prediction. The fibers are path traced
-(and denoised where the denoiser is installed).
+Both surface models get the geometry of ``surface_from_fabric`` and albedos fitted to small renders of the fibers under
+three lamps (``surface_albedos``), so that mean colours agree there; where highlights lie, and all of the distant view,
+is prediction. The fibers are path traced (and denoised where the denoiser is installed).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from usdfab.imaging import denoise, flip, grid, mse, write_image
 from usdfab.neural.aggregation import aggregate
 from usdfab.neural.cylinder import Cylinder
 from usdfab.neural.irawan import irawan_components
-from usdfab.neural.surface_albedos import fitted
+from usdfab.neural.surface_albedos import fit_reflection, observe
 from usdfab.neural.surface_from_fabric import SurfaceAlbedos, surface_from_fabric
 from usdfab.neural.surface_material import SurfaceMaterial
 from usdfab.neural.surface_swatch import View, swatch_view
@@ -40,6 +40,10 @@ FABRICS = {"plain": "linen", "twill": "denim", "satin": "silk-satin"}
 
 IRAWAN, JIN, FIBERS = "irawan_marschner_2012", "jin_2022", "fibers"
 VIEWS = ("close", "distant")
+
+CELLS_PER_PIXEL = 6.0
+"""Of the distant view: a pixel sees more than the repeat of any of the weaves, and no moire appears."""
+
 PICTURE, NUMBERS = "surface.png", "surface.json"
 
 
@@ -53,6 +57,10 @@ class Scale:
     samples: int = 256
     threads: int | None = None
     seed: int = 0
+
+
+SCALES = {"draft": Scale(96, 80, 32), "standard": Scale(240, 160, 256), "paper": Scale(512, 384, 1024)}
+"""By the names of ``--quality``."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +83,9 @@ class Comparison:
     rows: list[Difference]
 
 
-def compare_surfaces(
-    scale: Scale, progress: Progress | None = None, weaves: Sequence[str] = tuple(FABRICS)
-) -> Comparison:
-    """All weaves, views and models."""
+def compare_surfaces(scale: Scale, progress: Progress | None = None, weaves: Sequence[str] | None = None) -> Comparison:
+    """All weaves of ``FABRICS``, or some; both views, all models."""
+    weaves = tuple(FABRICS) if weaves is None else weaves
     pictures: dict[tuple[str, str, str], Floats] = {}
     rows: list[Difference] = []
     for index, weave in enumerate(weaves):
@@ -104,18 +111,16 @@ def _of_fabric(fabric: FabricParameters, scale: Scale) -> dict[tuple[str, str], 
     width = scale.close
     height = max(1, round(width * fabric.size[1] / fabric.size[0]))
     close = swatch_view(fabric, rig_for(fabric.size), (width, height))
-    cylinder = Cylinder(fabric)
+    cylinder = Cylinder(fabric, CELLS_PER_PIXEL * scale.distant)
     distant = cylinder.view(scale.distant)
     traced = {
         "close": _traced(swatch_scene(fabric), (width, height), scale),
         "distant": _traced(cylinder.scene(), (scale.distant, scale.distant), scale),
     }
     found: dict[tuple[str, str], Floats] = {}
+    lamps = observe(fabric, seed=scale.seed + 1, threads=scale.threads)
     for model in (IRAWAN, JIN):
-        seen = traced["close"].reshape(-1, 3) / close.light[:, None]
-        parts = _components(model, material, close, scale)
-        matrix = albedos.reflection.copy()
-        matrix[:2] = fitted(parts, seen, matrix[2:])
+        matrix = fit_reflection(lambda view, model=model: _components(model, material, view, scale), lamps)  # type: ignore[misc]
         colors = SurfaceAlbedos(matrix, albedos.transmission)
         for name, view in (("close", close), ("distant", distant)):
             found[name, model] = _shown(model, material, colors, view, scale)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from usdfab.fabric import FabricParameters
 from usdfab.usd.rig import Rig
@@ -41,8 +41,8 @@ class View:
         return image.reshape(*self.shape, 3)
 
 
-def swatch_view(fabric: FabricParameters, rig: Rig, resolution: tuple[int, int], *, behind: bool = False) -> View:
-    """The swatch of ``usd.rig.swatch_scene`` for (width, height) pixels; ``behind``: the lamp below the cloth."""
+def swatch_view(fabric: FabricParameters, rig: Rig, resolution: tuple[int, int], lamp: ArrayLike | None = None) -> View:
+    """The swatch of ``usd.rig.swatch_scene`` for (width, height) pixels; ``lamp`` (3,): another place of the lamp."""
     width, height = resolution
     x = (np.arange(width) + 0.5) / width * rig.sample_size[0]
     y = (height - np.arange(height) - 0.5) / height * rig.sample_size[1]
@@ -50,8 +50,7 @@ def swatch_view(fabric: FabricParameters, rig: Rig, resolution: tuple[int, int],
     # The cloth's origin is the picture's lower left corner, the rig's is its middle.
     points = np.column_stack([places - 0.5 * np.asarray(rig.sample_size), np.zeros(len(places))])
     to_camera = np.array([0.0, 0.0, rig.camera_height]) - points
-    lamp = np.array(rig.light_position) * ([1, 1, -1] if behind else [1, 1, 1])
-    to_light = lamp - points
+    to_light = np.asarray(rig.light_position if lamp is None else lamp, dtype=np.float64) - points
     distance = np.linalg.norm(to_light, axis=1)
     wo = to_camera / np.linalg.norm(to_camera, axis=1, keepdims=True)
     wi = to_light / distance[:, None]

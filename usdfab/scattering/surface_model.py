@@ -22,7 +22,10 @@ Directions and frames are (..., 3) arrays that broadcast; values are (...) float
 What holds (``tests/scattering/test_surface_model.py``): the flakes' projected area integrates to sigma; the specular
 term is reciprocal, for transmission as well; reflected and transmitted specular light together with what passes
 unscattered, exp(-T rho Lambda), is at most 1, and is the single scattering of a layer: it tends to T rho Lambda for a
-thin one. What does not: k_s = k_d = 1 reflects more than 1 in sum; the blended Lambert term is not reciprocal.
+thin one. Measured for k_s = 1 and alpha = 0.3, light that comes back, goes through, passes unscattered: 0.25, 0.04,
+0.14 in normal view, 0.41, 0.04, 0.00 at 83 degrees; what is missing would scatter more than once.
+
+What does not: k_s = k_d = 1 reflects more than 1 in sum (up to 1.4); the blended Lambert term is not reciprocal.
 """
 
 from __future__ import annotations
