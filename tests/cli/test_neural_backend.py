@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,13 @@ pytest.importorskip("torch")
 sys.path.append(str(Path(__file__).parent.parent / "neural"))
 
 from neural_examples import lively
-from pxr import Usd, UsdGeom, UsdLux
+from pxr import Sdf, Usd, UsdGeom, UsdLux
 
+from usdfab.fabric import preset, weave_from_name
 from usdfab.imaging import read_image
 from usdfab.neural.material_file import Weights, save_material_network
 from usdfab.neural.network import KINDS
+from usdfab.usd.fabric_io import write_fabric
 
 SMALL = ("--backend", "neural", "--resolution", 8)
 
@@ -49,8 +52,6 @@ def stage_with(path: Path, *, uv: bool = True) -> Path:
     mesh.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
     if uv:
         api = UsdGeom.PrimvarsAPI(mesh)
-        from pxr import Sdf
-
         coordinates = api.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex)
         coordinates.Set([(0, 0), (2, 0), (2, 2), (0, 2)])
     stage.Save()
@@ -109,16 +110,8 @@ def test_bad_weights_and_stages_end_in_one_line(run, tiny, tmp_path, weights):
         code, _, err = run("render", tiny, "-o", tmp_path / "a.exr", *SMALL, "--reflection-weights", file)
         assert code == 2 and said in err and err.count("\n") == 1 and str(file) in err
     stage = stage_with(tmp_path / "naked.usda", uv=False)
-    code, _, err = run("render", stage, "--fabric", tiny, "-o", tmp_path / "a.exr", *SMALL, *weights)
-    assert code == 2 and err.count("\n") == 1
-    from usdfab.fabric import preset
-    from usdfab.usd.fabric_io import write_fabric
-
-    assert preset("denim").weave.ends <= 16
-    from dataclasses import replace
-
-    from usdfab.fabric import weave_from_name
-
+    code, _, err = run("render", stage, "--fabric", tiny, "-o", tmp_path / "a.exr", *SMALL, *weights, "--strict")
+    assert code == 2 and "/M: the cloth has no texture coordinates" in err and err.count("\n") == 1
     rows = "/".join("1" * k + "0" + "1" * (16 - k) for k in range(17))
     write_fabric(replace(preset("denim"), weave=weave_from_name(rows)), tmp_path / "large.usda")
     code, _, err = run("render", tmp_path / "large.usda", "-o", tmp_path / "a.exr", *SMALL, *weights)

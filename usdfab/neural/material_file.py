@@ -23,7 +23,10 @@ INTERFACE = "tile 64 normal orientation; roughness, height scale; query 8; C_war
 """What numbers in and out mean: files that say something else cannot be used."""
 
 FOLDER = Path(__file__).parent / "weights"
-SHIPPED: dict[str, str] = {}
+SHIPPED = {
+    "reflection": "f77bea81835f40a6f424cebb5a1726fabea72ae1e88abed9431502745351d84d",
+    "transmission": "0e2cb4d2ecdce59765deceaf79ef6ad6ec51779ea98ff46d911644153960b278",
+}
 """SHA-256 of the shipped weights by kind, checked at each load."""
 
 LARGE = 256
