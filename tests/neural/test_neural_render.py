@@ -98,6 +98,8 @@ def brute_force(camera: Camera, light: PointLight, *, below: bool = False) -> ND
         steps.append(((origin - moved * (origin[2] / moved[..., 2:])) - points)[..., :2] / tile)
     across = np.linalg.svd(np.stack(steps, axis=-1), compute_uv=False)
     size = np.maximum(np.sqrt(across.prod(axis=-1)), across[..., 0] / 2)
+    # From half a tile on a pixel is filtered over twice its footprint.
+    size = np.where(size < 0.5, size + 2 * size**2, 2 * size)
     if back:
         material = reversed_material(material)
         place = np.stack([1 - place[..., 0], place[..., 1]], axis=-1)

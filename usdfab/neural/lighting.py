@@ -37,6 +37,16 @@ LEAST = 1e-3
 
 
 @njit(**OPTIONS)
+def filter_side(size):
+    """Side in tiles of the square that a pixel shows, from its footprint's: the same up close, twice it far away.
+
+    From half a tile a pixel on, pixels cannot show the weave (Nyquist), but a square as wide as their distance passes a
+    good part of it, which would be moiré. Of twice that side nothing of a pattern of one tile is left there.
+    """
+    return size * (1.0 + min(2.0 * size, 1.0))
+
+
+@njit(**OPTIONS)
 def unblocked(world, buffer, ox, oy, oz, dx, dy, dz, near, reach):
     """Share of light that comes through from distance ``reach``: cloth and opaque surfaces stop all of it."""
     if light_blocks(world.lights, ox, oy, oz, dx, dy, dz, reach):
@@ -144,7 +154,7 @@ def light_pixels(world, lights, u1, u2, share, tags, numbers, group, queries, we
             continue
         group[pixel] = 4 * tags[pixel, FABRIC] + 2 * tags[pixel, BACK] + (1 if iz < 0.0 else 0)
         q = queries[pixel]
-        q[0], q[1], q[2] = out[PLACE], out[PLACE + 1], out[SIZE]
+        q[0], q[1], q[2] = out[PLACE], out[PLACE + 1], filter_side(out[SIZE])
         q[3], q[4], q[5], q[6], q[7] = ix, iy, iz, out[VIEW], out[VIEW + 1]
         seen *= share
         weights[pixel, 0], weights[pixel, 1], weights[pixel, 2] = seen * lr, seen * lg, seen * lb
