@@ -108,7 +108,7 @@ def _lean_inputs(x, found, code, queries, start, count):
         ix, iy, iz, ox, oy = queries[q, 3], queries[q, 4], queries[q, 5], queries[q, 6], queries[q, 7]
         oz = math.sqrt(max(np.float32(1.0) - ox * ox - oy * oy, np.float32(0.0)))
         hx, hy, hz = ix + ox, iy + oy, iz + oz
-        norm = np.float32(1.0) / max(math.sqrt(hx * hx + hy * hy + hz * hz), np.float32(1e-6))
+        norm = np.float32(1.0 / max(math.sqrt(hx * hx + hy * hy + hz * hz), 1e-6))
         x[16, k], x[17, k], x[18, k], x[19, k], x[20, k] = ix, iy, iz, ox, oy
         x[21, k], x[22, k], x[23, k] = hx * norm, hy * norm, hz * norm
 

@@ -117,17 +117,17 @@ def build(
         if material.fabric < 0 and (np.any(material.emissive) or "emissiveColor" in material.textures):
             left_out("a surface that glows lights nothing in the neural backend", material.path)
     _check_uv(scene)
-    materials = []
+    materials: list[SurfaceMaterial] = []
     albedo = np.zeros((len(scene.fabrics), 2, 4, 3))
     for number, surface in enumerate(scene.fabrics):
-        material, colors = surface_from_fabric(surface.fabric)
-        material, cover = learned_material(material)
-        if max(material.rows, material.columns) > LARGEST_REPEAT:
+        cloth, colors = surface_from_fabric(surface.fabric)
+        cloth, cover = learned_material(cloth)
+        if max(cloth.rows, cloth.columns) > LARGEST_REPEAT:
             raise UsdfabError(
-                f"a weave of {material.columns} ends and {material.rows} picks is larger than the encoder takes "
+                f"a weave of {cloth.columns} ends and {cloth.rows} picks is larger than the encoder takes "
                 f"({LARGEST_REPEAT})", place=surface.path, remedy="use --backend embree",
             )  # fmt: skip
-        materials += [material, reversed_material(material)]
+        materials += [cloth, reversed_material(cloth)]
         albedo[number] = cover * np.stack([colors.reflection, colors.transmission])
     plans: list[Plan] = []
     if materials:
