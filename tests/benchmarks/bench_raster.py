@@ -42,7 +42,6 @@ from raster_reference import Reference
 
 from usdfab.fabric import SYSTEMS, FabricParameters
 from usdfab.fabric.sampling import sample_fabric
-from usdfab.fit.descent import deterministic
 from usdfab.fit.features import fast_dtype, load_features
 from usdfab.fit.raster import edges, hits, jumps, renderer as raster, shade, shadows
 from usdfab.fit.raster.curves import CurveModel
@@ -50,6 +49,7 @@ from usdfab.fit.raster.renderer import RasterSettings, raster_renderer
 from usdfab.fit.raster.unconstrained import parameters_of
 from usdfab.fit.raster_stage import QUALITIES, render_size
 from usdfab.fit.texture import Target, color_loss, texture_loss
+from usdfab.torch_run import deterministic
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import swatch_scene
 

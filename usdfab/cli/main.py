@@ -43,7 +43,7 @@ COMMANDS = {
     "info": "Print the fabrics of a file with all parameters, or what this machine has.",
     "check": "Check a USD file against USD's validators and usdfab's rules.",
     "dataset": "Make data sets of random fabrics or surface materials, to train networks on.",
-    "train": "Train the network that guesses a fabric from a photo.",
+    "train": "Train the network that guesses a fabric from a photo, or the neural material.",
     "evaluate": "Judge usdfab's estimates, and its losses, on photos.",
     "schema": "Print the folder of usdfab's USD schema, for PXR_PLUGINPATH_NAME.",
 }

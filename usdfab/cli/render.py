@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -40,7 +40,10 @@ def run(
     region: Annotated[
         str | None, Parameter(help="Only x0,y0,x1,y1 of the picture, in pixels or percent (25%).")
     ] = None,
-    spp: Annotated[int, Parameter(help="Samples per pixel; with --noise, the most.")] = 32,
+    spp: Annotated[
+        int | None,
+        Parameter(help="Samples per pixel, 32 by default; with --noise, the most. 1 with --backend neural."),
+    ] = None,
     time: Annotated[float | None, Parameter(help="Seconds after which to stop, if spp are not reached.")] = None,
     noise: Annotated[
         float | None, Parameter(help="Relative error to reach, e.g. 0.05; each tile stops when it is there.")
@@ -68,7 +71,11 @@ def run(
         str | None, Parameter(help="Dask scheduler tcp://HOST:PORT whose workers render, or local for processes here.")
     ] = None,
     backend: Annotated[
-        str, Parameter(help="embree, or mitsuba: the same fibers in Mitsuba 3, on a processor or a GPU.")
+        str,
+        Parameter(
+            help="embree; mitsuba: the same fibers in Mitsuba 3, on a processor or a GPU; neural: a network instead of "
+            "fibers, direct light only, fast."
+        ),
     ] = "embree",
     device: Annotated[
         str | None, Parameter(help="With --backend mitsuba: auto (the default), llvm, cuda or scalar.")
@@ -77,6 +84,10 @@ def run(
         str | None,
         Parameter(help="With --backend mitsuba: tiled (the default with llvm), or flattened: all fibers, close-ups."),
     ] = None,
+    reflection_weights: Annotated[
+        Path | None, Parameter(help="With --backend neural: a file of usdfab train neural instead of the shipped one.")
+    ] = None,
+    transmission_weights: Annotated[Path | None, Parameter(help="The same for light from behind the cloth.")] = None,
     strict: Annotated[
         bool, Parameter(negative="", help="Stop at whatever is wrong with the stage instead of leaving it out.")
     ] = False,
@@ -98,6 +109,7 @@ def run(
         usdfab render samples/drape.usda --fabric fabric.usda -o drape.exr --resolution 1280x960 --noise 0.05
         usdfab render walk.usda -o walk.####.exr --frames 1-48 --aov depth,normal --scheduler tcp://farm:8786
         usdfab render cloth.usda -o check.exr --backend mitsuba --resolution 256 --device llvm
+        usdfab render samples/drape.usda --fabric fabric.usda -o quick.png --backend neural
 
     Parameters
     ----------
@@ -114,18 +126,15 @@ def run(
     from usdfab.cli.scene_source import SceneSource, frame_numbers
     from usdfab.errors import UsdfabError
 
-    if backend == "mitsuba":
-        refused = {
+    _check_backend(
+        backend,
+        {
             "--time": time, "--noise": noise, "--aov": aov, "--denoise": denoise, "--tile": tile,
             "--checkpoint": checkpoint, "--resume": resume, "--workers": workers, "--scheduler": scheduler,
-        }  # fmt: skip
-        wrong = next((option for option, value in refused.items() if value is not None and value is not False), None)
-        if wrong:
-            raise UsdfabError("the Mitsuba backend has no such option", place=wrong, remedy="use --backend embree")
-    elif backend != "embree":
-        raise UsdfabError(f"there is no '{backend}'", place="--backend", remedy="choose embree or mitsuba")
-    elif device is not None or fibers is not None:
-        raise UsdfabError("is for --backend mitsuba", place="--device" if device is not None else "--fibers")
+        },
+        {"--device": device, "--fibers": fibers},
+        {"--reflection-weights": reflection_weights, "--transmission-weights": transmission_weights},
+    )  # fmt: skip
     target = output or Path(stage.stem + ".png")
     options = picture_options(target, aov, denoise, exposure, view, overwrite)
     part = parse_tile(tile)
@@ -146,7 +155,8 @@ def run(
     from usdfab.cli.render_frame import FrameOptions, render_frame
     from usdfab.tracer.render import RenderSettings, thread_count
 
-    settings = RenderSettings(size, spp, max_depth, seed, thread_count(threads), time, noise, part=part or (1, 1))
+    samples = spp if spp is not None else 1 if backend == "neural" else 32
+    settings = RenderSettings(size, samples, max_depth, seed, thread_count(threads), time, noise, part=part or (1, 1))
     texts = {"stage": stage, "fabric": fabric, "rig": rig}
     names = {name: str(path.absolute()) if path is not None else None for name, path in texts.items()}
 
@@ -155,6 +165,10 @@ def run(
 
     if backend == "mitsuba":
         from usdfab.cli.render_mitsuba import render_mitsuba
+    if backend == "neural":
+        from usdfab.cli.render_neural import load_networks, render_neural
+
+        networks = load_networks({"reflection": reflection_weights, "transmission": transmission_weights})
     results, warnings, worn = [], [], None
     place = "local" if scheduler is None and workers is not None else scheduler
     idle = place is None or all(file.finished for file in files)
@@ -166,6 +180,8 @@ def run(
                 facts, said, worn_here = render_mitsuba(
                     source(file), file, frame, device or "auto", threads, fibers or "auto"
                 )
+            elif backend == "neural":
+                facts, said, worn_here = render_neural(source(file), file, frame, networks)
             else:
                 facts, said, worn_here = render_frame(source(file), file, frame, remote)
             results.append(facts)
@@ -174,3 +190,25 @@ def run(
     if json:
         common = {"outputs": [file.output for file in files], "fabric": worn, "warnings": warnings}
         print_json(results[0] | common if numbers is None else {"frames": results} | common)
+
+
+def _check_backend(
+    backend: str, embree: dict[str, Any], mitsuba: dict[str, Any], neural: dict[str, Any]
+) -> None:  # fmt: skip
+    """Refuse options that are for other backends: ``embree``'s alone, ``mitsuba``'s and ``neural``'s."""
+    from usdfab.errors import UsdfabError
+
+    def given(options: dict[str, Any]) -> str | None:
+        return next((name for name, value in options.items() if value is not None and value is not False), None)
+
+    if backend not in ("embree", "mitsuba", "neural"):
+        raise UsdfabError(
+            f"there is no '{backend}'", place="--backend", remedy="choose embree or mitsuba, or neural to be quick"
+        )
+    if backend != "embree" and (wrong := given(embree)):
+        name = "Mitsuba" if backend == "mitsuba" else backend
+        raise UsdfabError(f"the {name} backend has no such option", place=wrong, remedy="use --backend embree")
+    if backend != "mitsuba" and (wrong := given(mitsuba)):
+        raise UsdfabError("is for --backend mitsuba", place=wrong)
+    if backend != "neural" and (wrong := given(neural)):
+        raise UsdfabError("is for --backend neural", place=wrong)

@@ -5,13 +5,24 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from cyclopts import Parameter
+from cyclopts import App, Parameter
 
 from usdfab.cli.options import Json, Output, Overwrite, Quiet, Seed, print_json, progress_bar, say
 
+HELP = """Train networks on data sets.
 
-def run(
-    what: Literal["fit-network"],
+Usage examples:
+
+    usdfab train fit-network fabrics -o network.safetensors
+    usdfab train neural surfaces -o material.safetensors --kind reflection
+"""
+
+run = App(name="train", help=HELP, help_format="markdown")
+run.command("usdfab.cli.train_neural:neural", name="neural")
+
+
+@run.command(name="fit-network")
+def fit_network(
     dataset: Path,
     /,
     *,
@@ -35,7 +46,7 @@ def run(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Train the network that guesses a fabric's weave, counts and parameters from one picture.
+    """Train stage 1 of ``usdfab fit``: it guesses a fabric's weave, counts and parameters from one picture.
 
     First the numbers that the network takes are computed for each sample, once: they are kept in a folder (beside
     OUTPUT by default), so that a data set may grow and an interrupted run goes on. Of ten pairs of samples seven are
@@ -49,8 +60,6 @@ def run(
 
     Parameters
     ----------
-    what:
-        fit-network: stage 1 of ``usdfab fit``.
     dataset:
         A folder of ``usdfab dataset fabrics``.
     """
@@ -63,12 +72,13 @@ def run(
     checked_output(output, (".safetensors",), overwrite=overwrite, kind="weights")
     require_fit_extra("train")
     from usdfab.fit.features import fast_dtype
-    from usdfab.fit.network.curves import write_curves
-    from usdfab.fit.network.fit import DEFAULT_EPOCHS, fit_network
+    from usdfab.fit.network.fit import DEFAULT_EPOCHS, fit_network as fit
     from usdfab.fit.network.inputs import feature_net
     from usdfab.fit.network.network_file import save_network
     from usdfab.fit.network.store import draw_inputs, prepare
-    from usdfab.fit.network.training import TrainSettings, checked_device
+    from usdfab.fit.network.training import TrainSettings
+    from usdfab.imaging.curves import write_curves
+    from usdfab.torch_run import checked_device
 
     settings = TrainSettings(model, DEFAULT_EPOCHS[model] if epochs is None else epochs, seed)
     where = checked_device(device)
@@ -82,7 +92,7 @@ def run(
         with progress_bar("drawing cloth", quiet=quiet) as update:
             data = replace(data, drawn=draw_inputs(folder, drawn, update))
     with progress_bar("training", quiet=quiet) as update:
-        fitted = fit_network(
+        fitted = fit(
             data, settings, device=str(where), checkpoint=state, resume=resume, learning_curve=learning_curve,
             progress=lambda done, total, text: update(done, total, f"training: {text}"),
         )  # fmt: skip

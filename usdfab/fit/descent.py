@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from torch import Tensor
 
 from usdfab.errors import UsdfabError
 from usdfab.files import whole_file
+from usdfab.torch_run import deterministic
 
 FORMAT = "usdfab-descent/1"
 BETAS, EPSILON = (0.9, 0.999), 1e-8
@@ -191,17 +191,6 @@ def _set_back(state: State, rate: float, number: float, names: Sequence[str], ba
 
 def _few(names: Sequence[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-
-
-@contextmanager
-def deterministic() -> Iterator[None]:
-    """Sums in the same order every time: threads that add as they come would round differently in every run."""
-    before, warned = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
-    torch.use_deterministic_algorithms(True)
-    try:
-        yield
-    finally:
-        torch.use_deterministic_algorithms(before, warn_only=warned)
 
 
 def save_state(state: State, path: Path, job: str) -> None:

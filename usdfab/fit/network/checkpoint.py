@@ -13,9 +13,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from usdfab.disk import refused
 from usdfab.errors import UsdfabError
 from usdfab.files import whole_file
-from usdfab.fit.network.disk import refused
 from usdfab.fit.network.store import Drawn, Rows
 
 if TYPE_CHECKING:

@@ -12,10 +12,10 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
+from usdfab.disk import refused
 from usdfab.errors import UsdfabError
 from usdfab.fabric.weave import PAPER_WEAVES
 from usdfab.files import whole_file
-from usdfab.fit.network.disk import refused
 from usdfab.fit.network.inputs import LEVELS, REVISION, SIZE, Basis
 from usdfab.fit.network.labels import LABELS
 from usdfab.fit.network.model import Paper, Robust

@@ -20,13 +20,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from torch import Tensor
 
+from usdfab.disk import refused
 from usdfab.errors import UsdfabError
 from usdfab.files import whole_file
 from usdfab.fit.dataset.reader import Stored, read_dataset
 from usdfab.fit.dataset.settings import Settings, settings_of
 from usdfab.fit.dataset.store import MANIFEST, read_manifest
 from usdfab.fit.features import FeatureNet
-from usdfab.fit.network.disk import refused
 from usdfab.fit.network.drawn import REVISION as DRAWN_REVISION, drawn_cloth
 from usdfab.fit.network.inputs import LEVELS, REVISION as INPUT_REVISION, Basis, fitted_basis, prepared, texture_vectors
 from usdfab.fit.network.labels import LABELS, weave_label

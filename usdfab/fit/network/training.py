@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,12 +14,12 @@ from torch import Tensor, nn
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric.weave import PAPER_WEAVES
-from usdfab.fit.descent import deterministic
 from usdfab.fit.network.checkpoint import State, identity_of, load_checkpoint, save_checkpoint
 from usdfab.fit.network.model import TEXTURE_COMPONENTS, Paper, Robust, bin_targets
 from usdfab.fit.network.paper import NUMBERS, shares
 from usdfab.fit.network.spectra import BIN_WIDTH, HIGH, LOW
 from usdfab.fit.network.store import Drawn, Prepared, Rows, component_counts
+from usdfab.torch_run import checked_device, deterministic, one_thread
 
 MODELS = ("robust", "paper")
 SAVE_EVERY = 10
@@ -157,26 +156,6 @@ def train(
     network.load_state_dict(state.best)
     network.eval().to("cpu")
     return Trained(network, state.history, state.best_epoch, len(rows.index.unique()), interrupted)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Small matrices: threads cost more than they bring, and where others compute too, thirteen times as much."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def checked_device(device: str) -> torch.device:
-    """The device of a ``--device``, ``cpu`` or ``cuda``; ``UsdfabError`` where there is no such thing."""
-    if device not in ("cpu", "cuda"):
-        raise UsdfabError(f"there is no device '{device}'", place="--device", remedy="use cpu or cuda")
-    if device == "cuda" and not torch.cuda.is_available():
-        raise UsdfabError("this machine has no GPU that torch can use", place="--device cuda", remedy="use cpu")
-    return torch.device(device)
 
 
 def chosen_rows(rows: Rows, settings: TrainSettings) -> Rows:

@@ -1,0 +1,146 @@
+"""A material ready to be asked: the decoder's weights with what depends on the material alone worked into them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from usdfab.neural.decoder_kernels import LANES, LEAN, PAPER, decode_range
+from usdfab.neural.examples import material_inputs
+from usdfab.neural.lean_network import ANGLES, FEATURES, LeanNetwork
+from usdfab.neural.network import MaterialNetwork
+from usdfab.neural.paper_network import LATENT, PaperNetwork
+from usdfab.neural.surface_material import SurfaceMaterial
+
+PIECE = 64 * LANES
+"""Queries that a thread takes at a time."""
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A decoder for one material as the kernel reads it.
+
+    Parameters
+    ----------
+    layers: (L, 8) int64
+        One row per layer, see ``decoder_kernels``.
+    weights, biases:
+        Of all layers, flat, float32.
+    code: (T, F)
+        The pyramid of the lean network; empty for the paper's, whose latent is in the first biases.
+    rows, angle_row:
+        Of a block's array; where the paper's directions are.
+    """
+
+    architecture: int
+    layers: NDArray[np.int64]
+    weights: Floats
+    biases: Floats
+    code: Floats
+    rows: int
+    angle_row: int
+    curvature: float
+
+    @property
+    def multiplications(self) -> int:
+        """Of a query in the layers."""
+        return int((self.layers[:, 1] * self.layers[:, 3]).sum())
+
+    def decode(self, queries: NDArray, threads: int = 1) -> Floats:
+        """C_warp, C_weft, S_warp, S_weft (N, 4) of queries (N, 8); the same on any number of threads."""
+        asked = np.ascontiguousarray(queries, dtype=np.float32)
+        out = np.empty((len(asked), 4), dtype=np.float32)
+
+        def piece(first: int) -> None:
+            decode_range(
+                self.architecture, self.layers, self.weights, self.biases, self.code, self.rows, self.angle_row,
+                self.curvature, asked, first, min(first + PIECE, len(asked)), out,
+            )  # fmt: skip
+
+        starts = range(0, len(asked), PIECE)
+        if threads == 1 or len(starts) < 2:
+            for first in starts:
+                piece(first)
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                list(pool.map(piece, starts))
+        return out
+
+
+def plans_of(network: MaterialNetwork, materials: Sequence[SurfaceMaterial]) -> list[Plan]:
+    """Materials ready to be asked; the encoder runs here, once."""
+    tiles, parameters = material_inputs(materials)
+    with torch.inference_mode():
+        codes = network.encode(tiles, parameters)
+    return [plan_of(network, code) for code in codes]
+
+
+def plan_of(network: MaterialNetwork, code: Tensor) -> Plan:
+    """A material ready to be asked, from its code."""
+    if isinstance(network, LeanNetwork):
+        return _lean_plan(network, code)
+    assert isinstance(network, PaperNetwork)
+    return _paper_plan(network, code)
+
+
+class _Builder:
+    """Layers one after the other."""
+
+    def __init__(self) -> None:
+        self.rows: list[list[int]] = []
+        self.weights: list[Floats] = []
+        self.biases: list[Floats] = []
+
+    def add(
+        self, first: int, start: int, layer: nn.Linear, *, bias: Floats | None = None, columns: slice = slice(None),
+        add: bool = False, activate: bool = True,
+    ) -> None:  # fmt: skip
+        """A layer that reads rows from ``first`` on and writes from ``start`` on; inputs are filled up to fours."""
+        matrix = layer.weight.detach().numpy()[:, columns].astype(np.float32)
+        matrix = np.pad(matrix, ((0, 0), (0, -matrix.shape[1] % 4)))
+        at = (sum(w.size for w in self.weights), sum(b.size for b in self.biases))
+        self.rows.append([first, matrix.shape[1], start, matrix.shape[0], *at, int(add), int(activate)])
+        self.weights.append(matrix.ravel())
+        self.biases.append(layer.bias.detach().numpy().astype(np.float32) if bias is None else bias)
+
+    def plan(self, architecture: int, code: Floats, rows: int, angle_row: int, curvature: float) -> Plan:
+        table = np.array(self.rows, dtype=np.int64)
+        weights, biases = np.concatenate(self.weights), np.concatenate(self.biases)
+        return Plan(architecture, table, weights, biases, code, rows, angle_row, curvature)
+
+
+def _lean_plan(network: LeanNetwork, code: Tensor) -> Plan:
+    width, builder = network.width, _Builder()
+    one = FEATURES + ANGLES
+    two, out = one + width, one + 2 * width
+    builder.add(0, one, network.first)
+    builder.add(one, two, network.second)
+    builder.add(two, one, network.third, add=True)
+    builder.add(one, out, network.last, activate=False)
+    pyramid = np.ascontiguousarray(code.detach().numpy(), dtype=np.float32)
+    return builder.plan(LEAN, pyramid, out + 4, FEATURES, network.curvature)
+
+
+def _paper_plan(network: PaperNetwork, code: Tensor) -> Plan:
+    builder = _Builder()
+    fusion, second = network.fusion
+    block = network.angular_block
+    assert isinstance(fusion, nn.Linear) and isinstance(second, nn.Linear)
+    latent = fusion.weight[:, :LATENT].detach() @ code.detach() + fusion.bias.detach()
+    # Rows: one-blobs, fusion, fused and directions (69, filled up to 72), two hidden layers in turn, four results.
+    builder.add(0, 24, fusion, bias=latent.numpy().astype(np.float32), columns=slice(LATENT, None))
+    builder.add(24, 88, second)
+    builder.add(88, 160, network.angular_in)
+    builder.add(160, 224, block.first)
+    builder.add(224, 160, block.second, add=True)
+    builder.add(160, 224, network.angular_hidden)
+    builder.add(224, 288, network.angular_out, activate=False)
+    return builder.plan(PAPER, np.zeros((1, FEATURES), dtype=np.float32), 292, 152, network.curvature)
