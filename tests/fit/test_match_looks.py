@@ -96,8 +96,9 @@ def test_separate_yarns_are_found_from_touching_ones(net: FeatureNet) -> None:
     assert result.losses[1] < 0.5 * result.losses[0]
 
 
-@pytest.mark.parametrize("lamp", [0, 3])
-def test_the_lamp_is_found(net: FeatureNet, lamp: int) -> None:
+@pytest.mark.parametrize("lamp", [0, 1])
+def test_the_ring_is_found(net: FeatureNet, lamp: int) -> None:
+    """Lamps to the side are not told apart here: plain weave looks alike when it is turned or mirrored."""
     rig = LAMPS[lamp](Seen(CLOTH, None)).rig
     result = match_photo(CLOTH, picture(CLOTH, rig), SHAPES, net=net)
     assert result.rig == rig

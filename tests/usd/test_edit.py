@@ -15,6 +15,7 @@ from usdfab.usd.colorways import COLOR_ATTRIBUTES, COLORWAY, colorways
 from usdfab.usd.edit import change_fabric, edit_fabric
 from usdfab.usd.fabric_io import FABRIC_PATH, preview_color, read_fabric, write_fabric
 from usdfab.usd.read_scene import read_scene
+from usdfab.usd.schema_source import SCHEMA_VERSION
 
 
 def dye(color: str):
@@ -144,7 +145,9 @@ def test_files_of_version_1_become_whole(tmp_path: Path, fabric: FabricParameter
     out = tmp_path / "g.usda"
     edit_fabric(path, {"seed": "2"}, out)
     assert check(out) == []
-    assert Usd.Stage.Open(str(out)).GetPrimAtPath(FABRIC_PATH).GetAttribute("usdfab:schemaVersion").Get() == 2
+    assert (
+        Usd.Stage.Open(str(out)).GetPrimAtPath(FABRIC_PATH).GetAttribute("usdfab:schemaVersion").Get() == SCHEMA_VERSION
+    )
 
 
 # --- colourways ------------------------------------------------------------------------------------------------------
