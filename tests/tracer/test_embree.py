@@ -171,11 +171,10 @@ def test_hits_on_a_patch_lie_on_their_fiber(fibers):
     flat = np.sqrt(1 - up**2)
     directions = np.c_[flat * np.cos(angle), flat * np.sin(angle), up]
     hit = shoot(tile.scene, origins, directions)
-    vertices = tile.scene._buffers[0][: -embree._PADDING].view(np.float32).reshape(-1, 4)[:, :].astype(float)
+    vertices = tile.vertices.astype(float)
     some = hit.hit
     assert some.mean() > 0.5
-    segments = tile.scene._buffers[1][: -embree._PADDING].view(np.uint32).astype(np.int64)
-    first = segments[hit.prim[some]]
+    first = tile.segments[hit.prim[some], 0].astype(np.int64)
     a, b, radius = vertices[first, :3], vertices[first + 1, :3], vertices[first, 3]
     place = origins[some] + hit.t[some, None] * directions[some]
     along = np.einsum("kx,kx->k", place - a, b - a) / np.einsum("kx,kx->k", b - a, b - a)
@@ -210,19 +209,3 @@ def test_threads_that_start_together_share_one_device():
         found = list(pool.map(ask, range(4)))
     assert len(made) == 1 and all(f is made[0] for f in found)
     assert all(hasattr(f, "__wrapped__") for f in (embree.library, embree.device, embree.function_addresses))
-
-
-def test_a_record_keeps_directions_and_a_curve_number_of_32_bits():
-    random = np.random.default_rng(0)
-    tangents = random.normal(size=(2, 50, 3))
-    tangents /= np.linalg.norm(tangents, axis=-1, keepdims=True)
-    numbers = random.integers(0, 2**31, 50)
-    numbers[:4] = 0, 2**15, 2**16 - 1, 2**31 - 1
-    records = patch_scene.pack_segments(*tangents, numbers)
-    assert records.nbytes == 16 * 50
-    for end in range(2):
-        kept = records[:, 3 * end : 3 * end + 3].astype(float)
-        kept /= np.linalg.norm(kept, axis=1, keepdims=True)
-        assert np.abs(kept - tangents[end]).max() < 4e-5
-    wide = records.astype(np.int64)
-    assert np.array_equal((wide[:, 6] & 0xFFFF) | (wide[:, 7] << 16), numbers)

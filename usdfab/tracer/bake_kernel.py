@@ -18,6 +18,7 @@ from usdfab.scattering.fiber_numba import fiber_direction, fiber_frame, load_fib
 from usdfab.tracer.counted import mix, next_uniform, start_stream
 from usdfab.tracer.intrinsics import KERNEL, NG, PRIM, U, borrow, new_ray_buffer
 from usdfab.tracer.slab import ESCAPED_UP, HIT, slab_occluded, trace_slab
+from usdfab.tracer.tangents import tangent_at
 from usdfab.tracer.world import HEIGHT, HIGH, LOW, MATERIAL, WIDTH, YARN, Patches
 
 HITS, BENT, PLACE, ACROSS, SKY, COLOR, WARP, LOOSE, PATHS, BACK, THROUGH = 0, 1, 4, 5, 7, 8, 11, 12, 13, 14, 17
@@ -57,7 +58,7 @@ def bake_rows(
     memory = new_ray_buffer(addresses[2])
     buffer = (borrow(memory[0]), borrow(memory[1]), memory[2])
     p = Patches(
-        borrow(patches.table), borrow(patches.handles), borrow(patches.segments), borrow(patches.materials),
+        borrow(patches.table), borrow(patches.handles), borrow(patches.records), borrow(patches.materials),
         borrow(patches.albedo), borrow(patches.curves),
     )  # fmt: skip
     table = p.table
@@ -100,12 +101,7 @@ def _follow(addresses, p, buffer, stream, lx, ly, lz, up, max_depth, last_warp, 
                 at = BACK if (outcome == ESCAPED_UP) == (up > 0.0) else THROUGH
                 out[at], out[at + 1], out[at + 2] = out[at] + beta_r, out[at + 1] + beta_g, out[at + 2] + beta_b
             return
-        segment = np.int64(words[PRIM])
-        s = np.float64(floats[U])
-        c = p.segments
-        ax = (1.0 - s) * c[segment, 0] + s * c[segment, 3]
-        ay = (1.0 - s) * c[segment, 1] + s * c[segment, 4]
-        az = (1.0 - s) * c[segment, 2] + s * c[segment, 5]
+        curve, ax, ay, az = tangent_at(p.records, 0, np.int64(words[PRIM]), np.float64(floats[U]))
         norm = 1.0 / math.sqrt(ax * ax + ay * ay + az * az)
         ax, ay, az = ax * norm, ay * norm, az * norm
         nx, ny, nz = np.float64(floats[NG]), np.float64(floats[NG + 1]), np.float64(floats[NG + 2])
@@ -113,7 +109,6 @@ def _follow(addresses, p, buffer, stream, lx, ly, lz, up, max_depth, last_warp, 
         nx, ny, nz = nx - dot * ax, ny - dot * ay, nz - dot * az
         norm = 1.0 / math.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-300))
         nx, ny, nz = nx * norm, ny * norm, nz * norm
-        curve = (np.int64(c[segment, 6]) & 0xFFFF) | (np.int64(c[segment, 7]) << 16)
         row = np.int64(p.curves[curve, MATERIAL])
         if depth == 0:
             out[HITS] += 1.0

@@ -178,7 +178,8 @@ class EmbreeScene:
 
     def __init__(self) -> None:
         lib = library()
-        self._buffers: list[NDArray[np.uint8]] = []
+        self.buffers: list[NDArray] = []
+        """What Embree reads, in the order in which it was added; not to be changed."""
         self._scenes: list[EmbreeScene] = []
         self._geometries = 0
         self.handle: int = lib.rtcNewScene(device())
@@ -193,7 +194,7 @@ class EmbreeScene:
         lib.rtcSetGeometryTimeStepCount(geometry, time_steps)
         for kind, slot, data_format, array, stride in buffers:
             memory = _padded(array)
-            self._buffers.append(memory)
+            self.buffers.append(memory)
             lib.rtcSetSharedGeometryBuffer(
                 geometry, kind, slot, data_format, memory.ctypes.data, 0, stride, array.nbytes // stride
             )
@@ -229,13 +230,15 @@ class EmbreeScene:
     @property
     def nbytes(self) -> int:
         """Bytes of the vertex and index buffers (the hierarchy comes on top)."""
-        return sum(b.nbytes for b in self._buffers)
+        return sum(b.nbytes for b in self.buffers)
 
 
-def _padded(array: NDArray) -> NDArray[np.uint8]:
+def _padded(array: NDArray) -> NDArray:
+    """A copy of the array with memory behind it that may be read."""
     memory = np.zeros(array.nbytes + _PADDING, dtype=np.uint8)
-    memory[: array.nbytes] = np.ascontiguousarray(array).view(np.uint8).ravel()
-    return memory
+    copy = memory[: array.nbytes].view(array.dtype).reshape(array.shape)
+    copy[...] = array
+    return copy
 
 
 def add_triangles(scene: EmbreeScene, points: NDArray, triangles: NDArray) -> None:
@@ -258,17 +261,19 @@ def curve_scene(vertices: NDArray, first: NDArray, flags: NDArray) -> EmbreeScen
     ----------
     vertices: (V, 4)
         x, y, z, radius.
-    first: (S,)
-        A segment joins vertex ``first[s]`` and ``first[s] + 1``.
+    first: (S,) or (S, N)
+        A segment joins vertex ``first[s]`` and ``first[s] + 1``. More columns stand in the buffer for who reads it
+        besides Embree. (Vertices could not have any: Embree wants them at multiples of 16 bytes.)
     flags: (S,)
         ``NEIGHBOR_LEFT | NEIGHBOR_RIGHT``: whether vertex ``first - 1`` and ``first + 2`` continue the curve.
     """
     scene = EmbreeScene()
+    first = np.asarray(first, dtype=np.uint32)
     scene.add(
         _GEOMETRY_ROUND_LINEAR_CURVE,
         [
-            (_BUFFER_VERTEX, 0, _FORMAT_FLOAT4, np.ascontiguousarray(vertices, dtype=np.float32), 16),
-            (_BUFFER_INDEX, 0, _FORMAT_UINT, np.ascontiguousarray(first, dtype=np.uint32), 4),
+            (_BUFFER_VERTEX, 0, _FORMAT_FLOAT4, np.asarray(vertices, dtype=np.float32), 16),
+            (_BUFFER_INDEX, 0, _FORMAT_UINT, first, 4 * int(np.prod(first.shape[1:]))),
             (_BUFFER_FLAGS, 0, _FORMAT_UCHAR, np.ascontiguousarray(flags, dtype=np.uint8), 1),
         ],
     )

@@ -53,6 +53,12 @@ def _as_pointer(typingctx, address):
     return signature, codegen
 
 
+@njit(cache=True, inline="always")
+def words_at(address):
+    """The memory at an address as uint32; who calls it knows how many there are."""
+    return carray(_as_pointer(address), 1 << 40, np.uint32)
+
+
 def _borrow(typingctx, array):
     signature = array(array)
 

@@ -36,10 +36,11 @@ from usdfab.tracer.intrinsics import KERNEL, NG, PRIM, U, borrow, new_ray_buffer
 from usdfab.tracer.lights import FAR, escaped_radiance, hit_light, light_blocks, sample_light
 from usdfab.tracer.slab import HIT, enter_slab, inverse_columns, leave_slab, slab_occluded, to_patch, trace_slab
 from usdfab.tracer.surfaces import MAX_SURFACES, surface_frame, trace_macro, transmittance
+from usdfab.tracer.tangents import tangent_at
 from usdfab.tracer.tape import start_tape, tape_direct, tape_light, tape_scatter
 from usdfab.tracer.textures import normal_at, opacity_at, surface_at
 from usdfab.tracer.vertex import camera_sample, pixel_shift, shading_frame, tint_at, tint_fiber, to_local
-from usdfab.tracer.world import ALBEDO_MAP, FIRST_CURVE, FIRST_PATCH, FIRST_SEGMENT, MATERIAL, YARN, borrowed
+from usdfab.tracer.world import ALBEDO_MAP, FIRST_CURVE, FIRST_PATCH, MATERIAL, YARN, borrowed
 
 RUSSIAN_ROULETTE_DEPTH = 5
 SHADOW_ROULETTE = 4.0 * math.pi
@@ -174,13 +175,7 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
         ax = ay = az = ex = ey = ez = fx = fy = fz = 0.0
         wox = woy = woz = 0.0
         if fiber:
-            segment = int(patches.table[patch, FIRST_SEGMENT]) + np.int64(words[PRIM])
-            s = np.float64(floats[U])
-            c = patches.segments
-            qx = (1.0 - s) * c[segment, 0] + s * c[segment, 3]
-            qy = (1.0 - s) * c[segment, 1] + s * c[segment, 4]
-            qz = (1.0 - s) * c[segment, 2] + s * c[segment, 5]
-            curve = (np.int64(c[segment, 6]) & 0xFFFF) | (np.int64(c[segment, 7]) << 16)
+            curve, qx, qy, qz = tangent_at(patches.records, patch, np.int64(words[PRIM]), np.float64(floats[U]))
             owner = patches.curves[int(patches.table[patch, FIRST_CURVE]) + curve]
             row = np.int64(owner[MATERIAL])
             # Tangents are vectors, normals covectors.

@@ -22,6 +22,7 @@ from usdfab.scattering.fiber_numba import pack_fiber
 from usdfab.scattering.roughness import absorption_from_albedo
 from usdfab.tracer.embree import NEIGHBOR_LEFT, NEIGHBOR_RIGHT, EmbreeScene, curve_scene
 from usdfab.tracer.knots import knots_of, polylines
+from usdfab.tracer.tangents import pack_tangents
 
 FIBER_RADIUS_UNITS = 0.1
 """Radius of the thinnest fiber in patch space. Embree's curve intersector has thresholds that are not relative: in
@@ -35,15 +36,15 @@ DARKEST = 1e-4
 class PatchScene:
     """One tile, ready for the kernels. Lengths in units of which ``units_per_meter`` make a metre.
 
-    ``segments`` (S, 8) int16, packed by ``pack_segments``; ``curves`` (curves, 2) 1 + yarn, warp first, then weft, and
-    row of ``materials``; ``materials`` (M, N) packed by ``pack_fiber``; ``albedo`` (M, 4) fiber albedo coefficients and
-    1 / q(gamma_N); ``systems`` (M,) whose they are: 0 warp, 1 weft.
+    ``tangents`` (V,) of the spline at the vertices, by ``pack_tangents``; ``curves`` (curves, 2) 1 + yarn, warp first,
+    then weft, and row of ``materials``; ``materials`` (M, N) packed by ``pack_fiber``; ``albedo`` (M, 4) fiber albedo
+    coefficients and 1 / q(gamma_N); ``systems`` (M,) whose they are: 0 warp, 1 weft.
     """
 
     size: tuple[float, float]
     z_range: tuple[float, float]
     scene: EmbreeScene
-    segments: NDArray[np.int16]
+    tangents: NDArray[np.uint32]
     materials: NDArray[np.float64]
     albedo: NDArray[np.float64]
     curves: NDArray[np.int32]
@@ -53,9 +54,20 @@ class PatchScene:
     """Shortest ray: hits nearer than this are the surface the ray starts on."""
 
     @property
+    def vertices(self) -> NDArray[np.float32]:
+        """(V, 4) x, y, z, radius: Embree's buffer."""
+        return self.scene.buffers[0]
+
+    @property
+    def segments(self) -> NDArray[np.uint32]:
+        """(S, 2) first of a segment's two vertices, and number of its curve: Embree's buffer."""
+        return self.scene.buffers[1]
+
+    @property
     def nbytes(self) -> int:
-        """Bytes of vertices, indices and records; Embree's hierarchy comes on top."""
-        return self.scene.nbytes + self.segments.nbytes + self.materials.nbytes + self.curves.nbytes
+        """Bytes of vertices, segments, tangents and tables; Embree's hierarchy comes on top."""
+        tables = self.tangents.nbytes + self.materials.nbytes + self.albedo.nbytes + self.curves.nbytes
+        return self.scene.nbytes + tables
 
 
 def build_tiles(fabric: FabricParameters) -> list[PatchScene]:
@@ -71,7 +83,7 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
         patch = generate_patch(fabric, copies=tile_copies(fabric))
     radius = min(s.radius for s in patch.systems)
     units = FIBER_RADIUS_UNITS / radius
-    vertices, first, flags, segments = [], [], [], []
+    vertices, tangents, segments, flags = [], [], [], []
     curves: list[NDArray] = []
     materials: list[NDArray] = []
     systems: list[int] = []
@@ -82,9 +94,9 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
         colors, color_of_curve = np.unique(system.albedo, axis=0, return_inverse=True)
         v, t, f, g, curve = _tile_segments(system, patch.size)
         vertices.append(units * np.c_[v, np.full(len(v), system.radius)])
-        first.append(f + base)
+        tangents.append(pack_tangents(t))
+        segments.append(np.c_[f + base, curve + sum(len(c) for c in curves)])
         flags.append(g)
-        segments.append(pack_segments(t[f], t[f + 1], curve + sum(len(c) for c in curves)))
         first_yarn = 1 if system.system == "warp" else 2 + int(patch.warp.yarn.max())
         curves.append(np.c_[system.yarn + first_yarn, color_of_curve.reshape(-1) + len(materials)])
         base += len(v)
@@ -93,14 +105,13 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
             materials.append(own[0])
             albedo.append(own[1])
             systems.append(SYSTEMS.index(system.system))
-    segment_vertex = np.concatenate(first).astype(np.int32)
-    scene = curve_scene(np.concatenate(vertices), segment_vertex, np.concatenate(flags))
+    scene = curve_scene(np.concatenate(vertices), np.concatenate(segments), np.concatenate(flags))
     low, high = patch.z_range
     return PatchScene(
         size=(units * patch.size[0], units * patch.size[1]),
         z_range=(units * (low - 1e-3 * radius), units * (high + 1e-3 * radius)),
         scene=scene,
-        segments=np.concatenate(segments),
+        tangents=np.concatenate(tangents),
         materials=np.stack(materials),
         albedo=np.asarray(albedo),
         curves=np.concatenate(curves).astype(np.int32),
@@ -108,16 +119,6 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
         units_per_meter=units,
         epsilon=5e-3 * FIBER_RADIUS_UNITS,
     )
-
-
-def pack_segments(start: NDArray, end: NDArray, curve: NDArray) -> NDArray[np.int16]:
-    """(S, 8) what a hit needs to know of its segment, in 16 bytes.
-
-    The spline's unit tangents at both ends (S, 3), 32767 for 1: kernels use their direction only. Then the curve's
-    number, its lower 16 bits first.
-    """
-    tangents = np.rint(32767.0 * np.c_[start, end]).astype(np.int16)
-    return np.c_[tangents, np.asarray(curve, dtype="<u4").view("<i2").reshape(-1, 2)]
 
 
 def pack_material(yarn: YarnParameters, color: tuple[float, ...]) -> tuple[NDArray[np.float64], tuple[float, ...]]:
@@ -148,7 +149,8 @@ def _tile_segments(
     """All segments that overlap the tile [0, size], copies from the neighbouring tiles included.
 
     Segments know the one before and after them only where that one overlaps the tile too, else their joint, a sphere
-    about their common vertex, does not.
+    about their common vertex, does not. Those that follow one another, be it from a curve to its successor, share their
+    vertex.
 
     Returns vertices (V, 3), tangents (V, 3), first vertex (S,), neighbour flags (S,) and curve (S,).
     """
@@ -156,45 +158,76 @@ def _tile_segments(
     curve_of_vertex = np.repeat(np.arange(system.curves), np.diff(offsets))
     place = np.arange(len(points)) - offsets[:-1][curve_of_vertex]
     lengths = np.diff(offsets)[curve_of_vertex]
+    # The vertex from which the next segment starts, and how many patches on; -1: none.
+    following, onward = np.arange(1, len(points) + 1), np.zeros(len(points), dtype=bool)
     if isinstance(system, OpenCurves):
         starts = np.flatnonzero(place <= lengths - 2)
+        following[place == lengths - 2] = -1
     else:
         # A curve's own segments: from vertex 1 up to the first vertex of its successor, one vertex spare each side.
         starts = np.flatnonzero((place >= 1) & (place <= lengths - 4))
-    # Which vertices have a segment before and after the one that starts there, be it a spare one.
-    joined = place > 0, place < lengths - 2
-    own = np.zeros(len(points) + 1, dtype=bool)
-    own[starts] = True
+        onward = place == lengths - 4
+        following[onward] = offsets[:-1][system.successor[curve_of_vertex[onward]]] + 1
     low = np.minimum(points[starts], points[starts + 1])[:, :2] - system.radius
     high = np.maximum(points[starts], points[starts + 1])[:, :2] + system.radius
 
     # Fibers reach the tiles beside their own; flyaways may reach farther.
     nearest = np.floor(-high.max(axis=0, initial=0.0) / size).astype(int) + 1
     farthest = np.ceil(1.0 - low.min(axis=0, initial=0.0) / size).astype(int) - 1
-    out_v, out_t, out_f, out_g, out_c = [], [], [], [], []
-    base = 0
+    vertex_parts, copy_parts = [], []
     for i in range(nearest[0], farthest[0] + 1):
         for j in range(nearest[1], farthest[1] + 1):
-            shift = np.array([i * size[0], j * size[1], 0.0])
-            inside = np.all((high + shift[:2] > 0.0) & (low + shift[:2] < np.asarray(size)), axis=1)
-            chosen = starts[inside]
-            if not len(chosen):
-                continue
-            used = np.zeros(len(points), dtype=bool)
-            here = np.zeros(len(points) + 1, dtype=bool)
-            here[chosen] = True
-            # A spare neighbour stands for a segment of another curve, of which nothing is known here.
-            before, after = (
-                flag[chosen] & (here[chosen + step] | ~own[chosen + step])
-                for flag, step in zip(joined, (-1, 1), strict=True)
-            )
-            for neighbors in (chosen, chosen + 1, chosen[before] - 1, chosen[after] + 2):
-                used[neighbors] = True
-            new_index = np.cumsum(used) - 1
-            out_v.append(points[used] + shift)
-            out_t.append(tangents[used])
-            out_f.append(new_index[chosen] + base)
-            out_g.append((NEIGHBOR_LEFT * before + NEIGHBOR_RIGHT * after).astype(np.uint8))
-            out_c.append(curve_of_vertex[chosen])
-            base += int(used.sum())
-    return tuple(np.concatenate(out) for out in (out_v, out_t, out_f, out_g, out_c))  # type: ignore[return-value]
+            shift = np.array([i * size[0], j * size[1]])
+            chosen = starts[np.all((high + shift > 0.0) & (low + shift < np.asarray(size)), axis=1)]
+            vertex_parts.append(chosen)
+            copy_parts.append(np.broadcast_to([i, j], (len(chosen), 2)))
+    vertex, copy = np.concatenate(vertex_parts), np.concatenate(copy_parts)
+    step = np.zeros(2, dtype=int) if isinstance(system, OpenCurves) else np.rint(system.period[:2] / size).astype(int)
+    order, joined = _in_a_row(vertex, copy, following[vertex], copy + onward[vertex, None] * step, len(points))
+    vertex, copy = vertex[order], copy[order]
+
+    # A vertex for the start of each segment, and one for the end where none follows.
+    ends = ~np.r_[joined[1:], False]
+    source = np.repeat(vertex, 1 + ends)
+    first = np.arange(len(vertex)) + np.cumsum(ends) - ends
+    source[first[ends] + 1] += 1
+    shift = np.c_[np.repeat(copy, 1 + ends, axis=0) * size, np.zeros(len(source))]
+    flags = (NEIGHBOR_LEFT * joined + NEIGHBOR_RIGHT * ~ends).astype(np.uint8)
+    return points[source] + shift, tangents[source], first, flags, curve_of_vertex[vertex]
+
+
+def _in_a_row(
+    vertex: NDArray[np.int64],
+    copy: NDArray[np.int64],
+    next_vertex: NDArray[np.int64],
+    next_copy: NDArray[np.int64],
+    vertices: int,
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Order of segments (S,) in which those that follow one another do so, and which ones follow the one before them.
+
+    A segment is known by the vertex (S,) that it starts from and its copy (S, 2); the next one's likewise, where there
+    is one. Nothing follows itself, however far one goes.
+    """
+    low, count = copy.min(axis=0), np.ptp(copy, axis=0) + 3
+
+    def key(v: NDArray[np.int64], c: NDArray[np.int64]) -> NDArray[np.int64]:
+        return ((c[:, 0] - low[0] + 1) * count[1] + c[:, 1] - low[1] + 1) * (vertices + 1) + v
+
+    keys = key(vertex, copy)
+    sort = np.argsort(keys, kind="stable")
+    wanted = key(next_vertex, next_copy)
+    found = sort[np.minimum(np.searchsorted(keys, wanted, sorter=sort), len(keys) - 1)]
+    follows = np.where((next_vertex >= 0) & (keys[found] == wanted), found, -1)
+    chained = follows >= 0
+    head = np.ones(len(vertex), dtype=bool)
+    head[follows[chained]] = False
+    # Rows of segments, all at once: who is k-th in which row.
+    row, rank = np.zeros(len(vertex), dtype=np.int64), np.zeros(len(vertex), dtype=np.int64)
+    here = np.flatnonzero(head)
+    number, k = np.arange(len(here)), 0
+    while len(here):
+        row[here], rank[here] = number, k
+        on = chained[here]
+        here, number, k = follows[here[on]], number[on], k + 1
+    order = np.lexsort((rank, row))
+    return order, ~head[order]

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.tracer import embree
+from usdfab.tracer.tangents import unpack_tangents
 from usdfab.tracer.world import (
     FIRST_CURVE,
     FIRST_PATCH,
-    FIRST_SEGMENT,
     HEIGHT,
     HIGH,
     LOW,
@@ -24,11 +24,10 @@ from usdfab.tracer.world import (
     UNITS,
     UV_SCALE,
     WIDTH,
-    Patches,
-    World,
 )
 
 if TYPE_CHECKING:
+    from usdfab.tracer.patch_scene import PatchScene
     from usdfab.tracer.render import Tracer
     from usdfab.usd.scene import Camera
 
@@ -71,7 +70,7 @@ def preview(tracer: Tracer, camera: Camera, width: int, height: int) -> NDArray[
     color = np.zeros((len(origins), 3))
     seen = np.flatnonzero(hits.hit)
     if len(seen):
-        color[seen] = _shade(world, directions[seen], hits.of(seen))
+        color[seen] = _shade(tracer, directions[seen], hits.of(seen))
     return (BRIGHTNESS * color).reshape(height, width, 3).astype(np.float32)
 
 
@@ -136,9 +135,9 @@ def trace(scene: int, origins: Floats, directions: Floats, ends: Floats, near: f
     )
 
 
-def _shade(world: World, directions: Floats, hits: Hits) -> Floats:
+def _shade(tracer: Tracer, directions: Floats, hits: Hits) -> Floats:
     """(N, 3) colours of hits on meshes."""
-    macro = world.macro
+    world, macro = tracer.world, tracer.world.macro
     placed = hits.copy >= 0
     prim = hits.prim.copy()
     prim[placed] += macro.first[hits.copy[placed]]
@@ -156,13 +155,13 @@ def _shade(world: World, directions: Floats, hits: Hits) -> Floats:
         own = fabric & (macro.fabrics[material, FIRST_PATCH] == first)
         color[own] = albedo * facing[own, None]
         into = np.flatnonzero(own & ~placed)  # cloth on placed copies is shown without its fibers
-        color[into] = _cloth(world, first, directions[into], prim[into], hits.u[into], hits.v[into])
+        color[into] = _cloth(tracer, first, directions[into], prim[into], hits.u[into], hits.v[into])
     return color
 
 
-def _cloth(world: World, first: int, directions: Floats, prim: NDArray[np.int64], u: Floats, v: Floats) -> Floats:
+def _cloth(tracer: Tracer, first: int, directions: Floats, prim: NDArray[np.int64], u: Floats, v: Floats) -> Floats:
     """(N, 3) colours where rays meet cloth: of the fibers of the tile ``first``, black where they go through."""
-    macro, patches = world.macro, world.patches
+    macro, patches = tracer.world.macro, tracer.world.patches
     table = patches.table[first]
     weights = np.stack([1.0 - u - v, u, v], axis=1)
     corner = np.einsum("kc,kcx->kx", weights, macro.corners[0, prim].astype(float))
@@ -194,7 +193,7 @@ def _cloth(world: World, first: int, directions: Floats, prim: NDArray[np.int64]
         axis = way.argmin(axis=1)
         t = way.min(axis=1)
         hits = trace(int(patches.handles[first]), place, d, t)
-        color[alive[hits.hit]] = _fibers(patches, first, d[hits.hit], hits.of(hits.hit))
+        color[alive[hits.hit]] = _fibers(tracer.tiles[first][1], d[hits.hit], hits.of(hits.hit))
         place = place + t[:, None] * d
         for side in range(2):
             here = axis == side
@@ -204,14 +203,13 @@ def _cloth(world: World, first: int, directions: Floats, prim: NDArray[np.int64]
     return color
 
 
-def _fibers(patches: Patches, first: int, directions: Floats, hits: Hits) -> Floats:
+def _fibers(tile: PatchScene, directions: Floats, hits: Hits) -> Floats:
     """(N, 3) colours of fibers, brighter across than along (Kajiya and Kay 1989) and where they face the camera."""
-    record = patches.segments[int(patches.table[first, FIRST_SEGMENT]) + hits.prim].astype(np.int64)
-    tangent = (1.0 - hits.u)[:, None] * record[:, :3] + hits.u[:, None] * record[:, 3:6]
+    start, curve = tile.segments[hits.prim].T
+    ends = [unpack_tangents(tile.tangents[vertex]) for vertex in (start, start + 1)]
+    tangent = (1.0 - hits.u)[:, None] * ends[0] + hits.u[:, None] * ends[1]
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     along = np.einsum("kx,kx->k", tangent, directions)
     normal = hits.normal / np.maximum(np.linalg.norm(hits.normal, axis=1, keepdims=True), 1e-300)
     facing = abs(np.einsum("kx,kx->k", normal, directions))
-    curve = (record[:, 6] & 0xFFFF) | (record[:, 7] << 16)
-    row = patches.curves[int(patches.table[first, FIRST_CURVE]) + curve, MATERIAL]
-    return patches.albedo[row, :3] * (facing * np.sqrt(np.maximum(1.0 - along**2, 0.0)))[:, None]
+    return tile.albedo[tile.curves[curve, MATERIAL], :3] * (facing * np.sqrt(np.maximum(1.0 - along**2, 0.0)))[:, None]

@@ -276,20 +276,21 @@ def pack_view(camera: Camera, width: int, height: int, moves: bool) -> View:
 
 
 def pack_patches(scenes: list[PatchScene]) -> Patches:
-    """Tiles as kernels read them."""
-    rows, segments, materials, count = [], 0, 0, 0
+    """Tiles as kernels read them; they hold addresses in the scenes, which the caller keeps."""
+    rows, materials, count = [], 0, 0
     curves = []
     for scene in scenes:
-        rows.append([*scene.size, *scene.z_range, scene.epsilon, segments, scene.units_per_meter, count])
+        rows.append([*scene.size, *scene.z_range, scene.epsilon, scene.units_per_meter, count])
         curves.append(scene.curves.copy())
         curves[-1][:, MATERIAL] += materials
-        segments += len(scene.segments)
         materials += len(scene.materials)
         count += len(scene.curves)
     return Patches(
         table=np.array(rows, dtype=float).reshape(-1, PATCH_COLUMNS),
         handles=np.array([s.scene.handle for s in scenes], dtype=np.uint64),
-        segments=np.concatenate([np.zeros((0, 8), dtype=np.int16), *(s.segments for s in scenes)]),
+        records=np.array([[s.tangents.ctypes.data, s.segments.ctypes.data] for s in scenes], dtype=np.uint64).reshape(
+            -1, 2
+        ),
         # Without fabrics one row of each: kernels read it before they know whether they need it.
         materials=np.concatenate([s.materials for s in scenes] or [np.zeros((1, FIBER_SIZE))]),
         albedo=np.concatenate([s.albedo for s in scenes] or [np.zeros((1, 4))]),

@@ -13,8 +13,8 @@ from usdfab.tracer.lights import Lights
 from usdfab.tracer.textures import Materials, Textures
 
 # Columns of ``Patches.table``. Lengths in patch units.
-WIDTH, HEIGHT, LOW, HIGH, EPSILON, FIRST_SEGMENT, UNITS, FIRST_CURVE = 0, 1, 2, 3, 4, 5, 6, 7
-PATCH_COLUMNS = 8
+WIDTH, HEIGHT, LOW, HIGH, EPSILON, UNITS, FIRST_CURVE = 0, 1, 2, 3, 4, 5, 6
+PATCH_COLUMNS = 7
 
 # Columns of ``Patches.curves``.
 YARN, MATERIAL = 0, 1
@@ -30,13 +30,12 @@ class Patches(NamedTuple):
     Parameters
     ----------
     table: (P, PATCH_COLUMNS)
-        Size and lowest and highest place of the tile, shortest ray, first segment, patch units per metre,
-        first of its curves in ``curves``.
+        Size and lowest and highest place of the tile, shortest ray, patch units per metre, first of its curves in
+        ``curves``.
     handles: (P,)
         Embree scenes.
-    segments: (S, 8) int16
-        The spline's tangents at both ends (6) and the curve of the patch (``patch_scene.pack_segments``): all that a
-        hit needs, in one cache line.
+    records: (P, 2)
+        Addresses of the tiles' tangents and segments (``PatchScene``), which kernels read where they are.
     materials: (M, FIBER_SIZE)
         Packed by ``pack_fiber``.
     albedo: (M, 4)
@@ -47,7 +46,7 @@ class Patches(NamedTuple):
 
     table: NDArray[np.float64]
     handles: NDArray[np.uint64]
-    segments: NDArray[np.int16]
+    records: NDArray[np.uint64]
     materials: NDArray[np.float64]
     albedo: NDArray[np.float64]
     curves: NDArray[np.int32]
@@ -141,7 +140,7 @@ def borrowed(world):
         borrow(m.mesh), borrow(m.fabrics), borrow(m.placements), borrow(m.first), borrow(m.bounds), m.meshes,
     )  # fmt: skip
     patches = Patches(
-        borrow(p.table), borrow(p.handles), borrow(p.segments), borrow(p.materials), borrow(p.albedo), borrow(p.curves)
+        borrow(p.table), borrow(p.handles), borrow(p.records), borrow(p.materials), borrow(p.albedo), borrow(p.curves)
     )
     return World(
         macro,
