@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
-from usdfab.neural.decoder import Plan, plans_of
+from usdfab.neural.cloth_scene import has_bodies, pack_cloth
+from usdfab.neural.decoder import Plan, pack_plans, plans_of
+from usdfab.neural.gbuffer import Cloth
 from usdfab.neural.material_file import Weights
+from usdfab.neural.strips import Decoders
 from usdfab.neural.surface_from_fabric import surface_from_fabric
 from usdfab.neural.surface_material import PAPER_GAP, SurfaceMaterial
 from usdfab.tracer import embree
@@ -54,17 +57,19 @@ class NeuralScene:
         Front lit from the front, from behind; back lit from its own front, from behind.
     albedo: (fabrics, 2, 4, 3)
         Of C_warp, C_weft, S_warp, S_weft, for light from the front and from behind.
-    mips, repeats:
-        See ``gbuffer.fill``.
+    decoders:
+        The plans for the compiled driver; None: ``plans`` are asked one by one.
+    cloth:
+        See ``gbuffer.Cloth``.
     embree:
         Keeps the meshes alive.
     """
 
     world: World
     plans: list[Plan]
-    albedo: NDArray[np.float64]
-    mips: NDArray[np.int32]
-    repeats: NDArray[np.float64]
+    decoders: Decoders | None
+    albedo: NDArray[np.float32]
+    cloth: Cloth
     lights: list[PlacedLight]
     embree: EmbreeScene
     warnings: tuple[str, ...]
@@ -117,6 +122,18 @@ def build(
         if material.fabric < 0 and (np.any(material.emissive) or "emissiveColor" in material.textures):
             left_out("a surface that glows lights nothing in the neural backend", material.path)
     _check_uv(scene)
+    plans, albedo = materials_of(scene, networks)
+    return _assemble(scene, plans, albedo, [*warnings], pictures, strict)
+
+
+def materials_of(scene: Scene, networks: Mapping[str, Weights]) -> tuple[list[Plan], NDArray[np.float32]]:
+    """``plans`` and ``albedo`` of a scene's fabrics; the encoders run here.
+
+    Raises
+    ------
+    UsdfabError
+        If a weave is larger than the encoder takes.
+    """
     materials: list[SurfaceMaterial] = []
     albedo = np.zeros((len(scene.fabrics), 2, 4, 3))
     for number, surface in enumerate(scene.fabrics):
@@ -133,7 +150,21 @@ def build(
     if materials:
         both = [plans_of(networks[kind].network, materials) for kind in ("reflection", "transmission")]
         plans = [both[kind][k] for k in range(len(materials)) for kind in (0, 1)]
-    return _assemble(scene, plans, albedo, [*warnings], pictures, strict)
+    return plans, albedo.astype(np.float32)
+
+
+def dressed(ready: NeuralScene, scene: Scene, networks: Mapping[str, Weights]) -> NeuralScene:
+    """A scene with its fabrics changed: their yarns, colours and weaves, nothing else. Takes milliseconds."""
+    plans, albedo = materials_of(scene, networks)
+    cloth = pack_cloth(scene, ready.world, ready.cloth.mips)
+    return replace(ready, plans=plans, decoders=pack_plans(plans), albedo=albedo, cloth=cloth)
+
+
+def relit(ready: NeuralScene, scene: Scene, pictures: Mapping[str, NDArray]) -> NeuralScene:
+    """A scene with other lights."""
+    world = ready.world._replace(lights=pack_lights(scene, dict(pictures)))
+    cloth = ready.cloth._replace(bodies=has_bodies(world))
+    return replace(ready, world=world, cloth=cloth, lights=_placed(scene, pictures))
 
 
 def _check_uv(scene: Scene) -> None:
@@ -146,7 +177,7 @@ def _check_uv(scene: Scene) -> None:
 
 
 def _assemble(
-    scene: Scene, plans: list[Plan], albedo: NDArray[np.float64], warnings: list[str],
+    scene: Scene, plans: list[Plan], albedo: NDArray[np.float32], warnings: list[str],
     pictures: Mapping[str, NDArray], strict: bool,
 ) -> NeuralScene:  # fmt: skip
     maps = [surface.albedo_map for surface in scene.fabrics]
@@ -171,15 +202,17 @@ def _assemble(
         macro, pack_patches([]), rows, pack_textures(used, images), pack_lights(scene, dict(pictures)),
         addresses,  # type: ignore[arg-type]
     )  # fmt: skip
-    repeats = np.ones((max(len(scene.fabrics), 1), 2))
-    for row, surface in zip(repeats, scene.fabrics, strict=False):
-        fabric = surface.fabric
-        row[:] = fabric.cell[0] * fabric.weave.ends, fabric.cell[1] * fabric.weave.picks
-    lights = [
+    return NeuralScene(
+        world, plans, pack_plans(plans), albedo, pack_cloth(scene, world, mips),
+        _placed(scene, pictures), embree_scene, (*warnings, *said, *more),
+    )  # fmt: skip
+
+
+def _placed(scene: Scene, pictures: Mapping[str, NDArray]) -> list[PlacedLight]:
+    return [
         PlacedLight(pack_lights(replace(scene, lights=(light,)), dict(pictures)), _places(light))
         for light in scene.lights
     ]
-    return NeuralScene(world, plans, albedo, mips, repeats, lights, embree_scene, (*warnings, *said, *more))
 
 
 def _places(light: Light) -> int:
