@@ -87,8 +87,13 @@ class Plan:
 def plans_of(network: MaterialNetwork, materials: Sequence[SurfaceMaterial]) -> list[Plan]:
     """Materials ready to be asked; the encoder runs here, once."""
     tiles, parameters = material_inputs(materials)
-    with torch.inference_mode():
-        codes = network.encode(tiles, parameters)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # so little work is done before other threads have woken
+    try:
+        with torch.inference_mode():
+            codes = network.encode(tiles, parameters)
+    finally:
+        torch.set_num_threads(threads)
     return [plan_of(network, code) for code in codes]
 
 

@@ -67,9 +67,7 @@ class LiveScene:
             As ``fabric.edited``; for a weave that is larger than the encoder takes. Nothing is changed then.
         """
         together = {**self.settings, **settings}
-        fabrics = tuple(
-            replace(surface, fabric=edited(surface.fabric, together)) for surface in self.first.fabrics
-        )
+        fabrics = tuple(replace(surface, fabric=edited(surface.fabric, together)) for surface in self.first.fabrics)
         scene = replace(self.scene, fabrics=fabrics)
         self.ready = dressed(self.ready, scene, self.networks)
         if not np.array_equal(repeats_of(self.scene), repeats_of(scene)):

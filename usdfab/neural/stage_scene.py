@@ -53,6 +53,8 @@ class NeuralScene:
 
     Parameters
     ----------
+    materials: 2 to each fabric
+        Front and back, as the networks know them.
     plans: 4 to each fabric
         Front lit from the front, from behind; back lit from its own front, from behind.
     albedo: (fabrics, 2, 4, 3)
@@ -66,6 +68,7 @@ class NeuralScene:
     """
 
     world: World
+    materials: list[SurfaceMaterial]
     plans: list[Plan]
     decoders: Decoders | None
     albedo: NDArray[np.float32]
@@ -122,12 +125,12 @@ def build(
         if material.fabric < 0 and (np.any(material.emissive) or "emissiveColor" in material.textures):
             left_out("a surface that glows lights nothing in the neural backend", material.path)
     _check_uv(scene)
-    plans, albedo = materials_of(scene, networks)
-    return _assemble(scene, plans, albedo, [*warnings], pictures, strict)
+    materials, albedo = materials_of(scene)
+    return _assemble(scene, materials, asked_plans(materials, networks), albedo, [*warnings], pictures, strict)
 
 
-def materials_of(scene: Scene, networks: Mapping[str, Weights]) -> tuple[list[Plan], NDArray[np.float32]]:
-    """``plans`` and ``albedo`` of a scene's fabrics; the encoders run here.
+def materials_of(scene: Scene) -> tuple[list[SurfaceMaterial], NDArray[np.float32]]:
+    """Front and back of a scene's fabrics as the networks know them, and ``albedo`` of ``NeuralScene``.
 
     Raises
     ------
@@ -146,18 +149,24 @@ def materials_of(scene: Scene, networks: Mapping[str, Weights]) -> tuple[list[Pl
             )  # fmt: skip
         materials += [cloth, reversed_material(cloth)]
         albedo[number] = cover * np.stack([colors.reflection, colors.transmission])
-    plans: list[Plan] = []
-    if materials:
-        both = [plans_of(networks[kind].network, materials) for kind in ("reflection", "transmission")]
-        plans = [both[kind][k] for k in range(len(materials)) for kind in (0, 1)]
-    return plans, albedo.astype(np.float32)
+    return materials, albedo.astype(np.float32)
+
+
+def asked_plans(materials: Sequence[SurfaceMaterial], networks: Mapping[str, Weights]) -> list[Plan]:
+    """``plans`` of ``NeuralScene``; the encoders run here."""
+    if not materials:
+        return []
+    both = [plans_of(networks[kind].network, materials) for kind in ("reflection", "transmission")]
+    return [both[kind][k] for k in range(len(materials)) for kind in (0, 1)]
 
 
 def dressed(ready: NeuralScene, scene: Scene, networks: Mapping[str, Weights]) -> NeuralScene:
     """A scene with its fabrics changed: their yarns, colours and weaves, nothing else. Takes milliseconds."""
-    plans, albedo = materials_of(scene, networks)
-    cloth = pack_cloth(scene, ready.world, ready.cloth.mips)
-    return replace(ready, plans=plans, decoders=pack_plans(plans), albedo=albedo, cloth=cloth)
+    materials, albedo = materials_of(scene)
+    if [_identity(m) for m in materials] != [_identity(m) for m in ready.materials]:
+        plans = asked_plans(materials, networks)
+        ready = replace(ready, materials=materials, plans=plans, decoders=pack_plans(plans))
+    return replace(ready, albedo=albedo, cloth=pack_cloth(scene, ready.world, ready.cloth.mips))
 
 
 def relit(ready: NeuralScene, scene: Scene, pictures: Mapping[str, NDArray]) -> NeuralScene:
@@ -165,6 +174,14 @@ def relit(ready: NeuralScene, scene: Scene, pictures: Mapping[str, NDArray]) -> 
     world = ready.world._replace(lights=pack_lights(scene, dict(pictures)))
     cloth = ready.cloth._replace(bodies=has_bodies(world))
     return replace(ready, world=world, cloth=cloth, lights=_placed(scene, pictures))
+
+
+def _identity(material: SurfaceMaterial) -> tuple:
+    """All that an encoder sees of a material."""
+    return (
+        material.weave.shape, material.weave.tobytes(), material.twist, material.inclination, material.roughness,
+        material.height_scale, material.gap,
+    )  # fmt: skip
 
 
 def _check_uv(scene: Scene) -> None:
@@ -177,8 +194,8 @@ def _check_uv(scene: Scene) -> None:
 
 
 def _assemble(
-    scene: Scene, plans: list[Plan], albedo: NDArray[np.float32], warnings: list[str],
-    pictures: Mapping[str, NDArray], strict: bool,
+    scene: Scene, materials: list[SurfaceMaterial], plans: list[Plan], albedo: NDArray[np.float32],
+    warnings: list[str], pictures: Mapping[str, NDArray], strict: bool,
 ) -> NeuralScene:  # fmt: skip
     maps = [surface.albedo_map for surface in scene.fabrics]
     wanted = [t for m in scene.materials if m.fabric < 0 for t in m.textures.values()] + [m for m in maps if m]
@@ -203,7 +220,7 @@ def _assemble(
         addresses,  # type: ignore[arg-type]
     )  # fmt: skip
     return NeuralScene(
-        world, plans, pack_plans(plans), albedo, pack_cloth(scene, world, mips),
+        world, materials, plans, pack_plans(plans), albedo, pack_cloth(scene, world, mips),
         _placed(scene, pictures), embree_scene, (*warnings, *said, *more),
     )  # fmt: skip
 
