@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +15,17 @@ pytest.importorskip("torch")
 sys.path += [str(Path(__file__).parent), str(Path(__file__).parent.parent / "tracer")]
 
 from neural_examples import lively
+from numba import njit
 from numpy.typing import NDArray
 from scenes import cloth_material, dome, fabric, lambert, look, plane, scene
 
 from usdfab.errors import UsdfabError
 from usdfab.neural.aggregation import aggregate
-from usdfab.neural.gbuffer import NUMBERS, PLACE, SIZE, TAGS, VIEW, fill, pixel_footprint
+from usdfab.neural.gbuffer import NUMBERS, PLACE, SIZE, VIEW, pixel_footprint
 from usdfab.neural.material_file import Weights
 from usdfab.neural.network import KINDS
-from usdfab.neural.render import places_of, render
+from usdfab.neural.render import Buffer, places_of, render, see
+from usdfab.neural.simd import LANES, load, store
 from usdfab.neural.stage_scene import NeuralScene, build, learned_material, mip_levels, reversed_material
 from usdfab.neural.surface_from_fabric import surface_from_fabric
 from usdfab.neural.surface_material import SurfaceMaterial
@@ -42,7 +45,9 @@ class Surface:
         self.material, self.transmission = material, transmission
 
     def decode(self, queries: NDArray) -> NDArray:
-        return aggregate(self.material, queries, transmission=self.transmission, samples=256, threads=1)
+        # One by one: the same samples in whichever order the pixels come.
+        ask = partial(aggregate, self.material, transmission=self.transmission, samples=256, threads=1)
+        return np.concatenate([ask(query[None]) for query in queries])
 
 
 def ready(world: Scene) -> NeuralScene:
@@ -52,7 +57,7 @@ def ready(world: Scene) -> NeuralScene:
     for surface in world.fabrics:
         material = learned_material(surface_from_fabric(surface.fabric)[0])[0]
         plans += [Surface(m, t) for m in (material, reversed_material(material)) for t in (False, True)]
-    return replace(made, plans=plans)
+    return replace(made, plans=plans, decoders=None)
 
 
 def on_cloth(*lights, meshes=(), materials=()) -> Scene:
@@ -107,7 +112,7 @@ def brute_force(camera: Camera, light: PointLight, *, below: bool = False) -> ND
     lit_from_behind = incoming[0, 0, 2] < 0
     assert lit_from_behind == below
     queries = np.concatenate([place, size[..., None], incoming, outgoing[..., :2]], axis=-1).reshape(-1, 8)
-    answers = aggregate(material, queries, transmission=below, samples=256, threads=1)
+    answers = Surface(material, below).decode(queries)
     colors_here = colors.transmission if below else colors.reflection
     radiance = cover * (answers @ colors_here).reshape(*points.shape)
     return radiance * light.intensity / distance**2
@@ -148,27 +153,37 @@ def test_footprints_on_a_plane_are_those_of_perspective() -> None:
 
 
 def buffer(camera: Camera) -> NDArray[np.float64]:
+    """The numbers (pixels, NUMBERS) of a picture, row by row."""
     made = ready(on_cloth(ABOVE))
-    count = SIZE_PX[0] * SIZE_PX[1]
-    tags, numbers = np.zeros((count, TAGS), dtype=np.int32), np.zeros((count, NUMBERS))
-    view = pack_view(camera, *SIZE_PX, False)
-    fill(
-        made.world, view, made.mips, made.repeats, 0.5, 0.5, 1.0, 0, SIZE_PX[0], 0, SIZE_PX[1], tags, numbers,
-        np.zeros((count, 3)),
+    _tags, numbers, _seen = see(made, pack_view(camera, *SIZE_PX, False), 1, 0, (0, 0, *SIZE_PX))
+    # Tiles of 4 x 4: one row of two, the second half empty.
+    width, height = SIZE_PX
+    tiles = numbers.reshape(NUMBERS, 1, 2, 4, 4).transpose(1, 3, 2, 4, 0).reshape(4, 8, NUMBERS)
+    return tiles[:height, :width].reshape(-1, NUMBERS).astype(float)
+
+
+@njit
+def sides(matrices, out):
+    out[:] = 0.0
+    store(
+        out, 0,
+        pixel_footprint(load(matrices, 0), load(matrices, LANES), load(matrices, 2 * LANES), load(matrices, 3 * LANES)),
     )  # fmt: skip
-    return numbers
 
 
 def test_footprint_of_a_parallelogram() -> None:
-    rng = np.random.default_rng(0)
-    for a, b, c, d in rng.normal(size=(20, 4)):
+    matrices = np.random.default_rng(0).normal(size=(4, LANES)).astype(np.float32)
+    out = np.zeros(LANES, dtype=np.float32)
+    sides(matrices.ravel(), out)
+    for (a, b, c, d), side in zip(matrices.T.astype(float), out, strict=True):
         long, short = np.linalg.svd(np.array([[a, c], [b, d]]), compute_uv=False)
-        assert pixel_footprint(a, b, c, d) == pytest.approx(max(math.sqrt(long * short), long / 2))
+        assert side == pytest.approx(max(math.sqrt(long * short), long / 2))
 
 
 def test_cloth_and_other_surfaces_throw_shadows_on_each_other() -> None:
     camera = look((0.0, 0.0, 0.06), (0, 0, 0), (0.15, 0.1))
-    card = plane(0.005, material=1, z=0.02, center=(0.01, 0.005))
+    middle = np.array([0.0102, 0.005])  # no pixel lies on the shadow's border
+    card = plane(0.005, material=1, z=0.02, center=tuple(middle))
     world = on_cloth(ABOVE, meshes=[card], materials=[lambert()])
     lit, dark = draw(on_cloth(ABOVE), camera), draw(world, camera)
     shadow = (dark < 1e-9).all(axis=-1)
@@ -177,9 +192,9 @@ def test_cloth_and_other_surfaces_throw_shadows_on_each_other() -> None:
     origin, directions = rays(camera)
     points = origin - directions * (origin[2] / directions[..., 2:])
     to_card = points + (ABOVE.position - points) * (0.02 / ABOVE.position[2])
-    hidden = (np.abs(to_card[..., :2] - [0.01, 0.005]) < 0.0025).all(axis=-1)
+    hidden = (np.abs(to_card[..., :2] - middle) < 0.0025).all(axis=-1)
     seen = points * (0.04 / 0.06)
-    on_card = (np.abs(seen[..., :2] - [0.01, 0.005]) < 0.0025).all(axis=-1)
+    on_card = (np.abs(seen[..., :2] - middle) < 0.0025).all(axis=-1)
     assert np.array_equal(shadow, hidden & ~on_card)
     # The surface model's samples depend on how many pixels are asked about together.
     assert np.allclose(dark[~hidden & ~on_card], lit[~hidden & ~on_card], rtol=0.15)
@@ -206,6 +221,19 @@ def test_threads_and_regions_do_not_change_the_picture() -> None:
     part = render(made, camera, (40, 40), (7, 20, 33, 39), spp=2)
     assert np.allclose(part.pixels, whole.pixels[20:39, 7:33], rtol=1e-5)
     assert whole.decodes > 0 and np.isfinite(whole.pixels).all()
+
+
+def test_a_kept_buffer_gives_the_same_picture_and_follows_lights_and_materials() -> None:
+    camera = look((0.01, -0.03, 0.05), (0, 0, 0), (0.2, 0.2))
+    whole, kept = ((40, 24), (0, 0, 40, 24)), Buffer()
+    first, other = build(on_cloth(ABOVE), NETWORKS, {}), build(on_cloth(dome(0.2)), NETWORKS, {})
+    assert np.array_equal(render(first, camera, *whole, buffer=kept).pixels, render(first, camera, *whole).pixels)
+    assert len(kept.strips) == 3
+    moved = replace(first, lights=other.lights)
+    assert np.array_equal(render(moved, camera, *whole, buffer=kept).pixels, render(moved, camera, *whole).pixels)
+    dyed = replace(first, albedo=first.albedo * np.float32(0.5))
+    half = render(dyed, camera, *whole, buffer=kept).pixels
+    assert np.allclose(half, 0.5 * render(first, camera, *whole).pixels, rtol=1e-5)
 
 
 def test_places_on_lights_go_on_from_sample_to_sample() -> None:

@@ -34,6 +34,7 @@ COMMANDS = {
     "render": "Render a fabric as a swatch, or a stage whose meshes wear fabrics.",
     "merge": "Join the parts of a picture that render --tile wrote.",
     "inspect": "Look at the fibers of a fabric, in a window or as a picture.",
+    "view": "Look at cloth in real time, and change it, in a window or as a picture.",
     "bind": "Put a fabric on the cloth of a stage, and see how it stretches.",
     "expand": "Write the cloth of a stage as instanced fibers for any USD program.",
     "export": "Bake a fabric into maps for any program: USD layer, MaterialX, USDZ, U3M.",

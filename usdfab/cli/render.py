@@ -74,7 +74,7 @@ def run(
         str,
         Parameter(
             help="embree; mitsuba: the same fibers in Mitsuba 3, on a processor or a GPU; neural: a network instead of "
-            "fibers, direct light only, fast."
+            "fibers, direct light only, fast; auto: fibers near, the network far."
         ),
     ] = "embree",
     device: Annotated[
@@ -126,10 +126,11 @@ def run(
     from usdfab.cli.scene_source import SceneSource, frame_numbers
     from usdfab.errors import UsdfabError
 
+    timing = {"--time": time, "--noise": noise}
     _check_backend(
         backend,
         {
-            "--time": time, "--noise": noise, "--aov": aov, "--denoise": denoise, "--tile": tile,
+            **({} if backend == "auto" else timing), "--aov": aov, "--denoise": denoise, "--tile": tile,
             "--checkpoint": checkpoint, "--resume": resume, "--workers": workers, "--scheduler": scheduler,
         },
         {"--device": device, "--fibers": fibers},
@@ -165,10 +166,12 @@ def run(
 
     if backend == "mitsuba":
         from usdfab.cli.render_mitsuba import render_mitsuba
-    if backend == "neural":
+    if backend in ("neural", "auto"):
+        from usdfab.cli.render_auto import render_auto
         from usdfab.cli.render_neural import load_networks, render_neural
 
-        networks = load_networks({"reflection": reflection_weights, "transmission": transmission_weights})
+        files_of = {"reflection": reflection_weights, "transmission": transmission_weights}
+        networks = load_networks(files_of, f"--backend {backend}")
     results, warnings, worn = [], [], None
     place = "local" if scheduler is None and workers is not None else scheduler
     idle = place is None or all(file.finished for file in files)
@@ -182,6 +185,8 @@ def run(
                 )
             elif backend == "neural":
                 facts, said, worn_here = render_neural(source(file), file, frame, networks)
+            elif backend == "auto":
+                facts, said, worn_here = render_auto(source(file), file, frame, networks)
             else:
                 facts, said, worn_here = render_frame(source(file), file, frame, remote)
             results.append(facts)
@@ -201,7 +206,7 @@ def _check_backend(
     def given(options: dict[str, Any]) -> str | None:
         return next((name for name, value in options.items() if value is not None and value is not False), None)
 
-    if backend not in ("embree", "mitsuba", "neural"):
+    if backend not in ("embree", "mitsuba", "neural", "auto"):
         raise UsdfabError(
             f"there is no '{backend}'", place="--backend", remedy="choose embree or mitsuba, or neural to be quick"
         )
@@ -210,5 +215,5 @@ def _check_backend(
         raise UsdfabError(f"the {name} backend has no such option", place=wrong, remedy="use --backend embree")
     if backend != "mitsuba" and (wrong := given(mitsuba)):
         raise UsdfabError("is for --backend mitsuba", place=wrong)
-    if backend != "neural" and (wrong := given(neural)):
+    if backend not in ("neural", "auto") and (wrong := given(neural)):
         raise UsdfabError("is for --backend neural", place=wrong)

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from usdfab.usd.scene import Camera, Mesh, Scene
 
 
-def load_networks(files: Mapping[str, Path | None]) -> dict[str, Weights]:
+def load_networks(files: Mapping[str, Path | None], what: str = "--backend neural") -> dict[str, Weights]:
     """The networks for light from the front and from behind: those given, else those that ship with usdfab."""
     from usdfab.neural.extra import require_neural_extra
 
-    require_neural_extra("--backend neural")
+    require_neural_extra(what)
     from usdfab.neural.material_file import load_material_network
 
     return {kind: load_material_network(files.get(kind), kind) for kind in ("reflection", "transmission")}

@@ -11,14 +11,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from usdfab.neural.decoder_kernels import LANES, LEAN, PAPER, decode_range
+from usdfab.neural.decoder_kernels import BIASES, BLOCK, LEAN, PAPER, WEIGHTS, decode_range
+from usdfab.neural.encoding import QUERY_COLUMNS
 from usdfab.neural.examples import material_inputs
 from usdfab.neural.lean_network import ANGLES, FEATURES, LeanNetwork
 from usdfab.neural.network import MaterialNetwork
 from usdfab.neural.paper_network import LATENT, PaperNetwork
+from usdfab.neural.strips import Decoders
 from usdfab.neural.surface_material import SurfaceMaterial
 
-PIECE = 64 * LANES
+PIECE = 512 * BLOCK
 """Queries that a thread takes at a time."""
 
 Floats = NDArray[np.float32]
@@ -56,16 +58,16 @@ class Plan:
 
     def decode(self, queries: NDArray, threads: int = 1) -> Floats:
         """C_warp, C_weft, S_warp, S_weft (N, 4) of queries (N, 8); the same on any number of threads."""
-        asked = np.ascontiguousarray(queries, dtype=np.float32)
-        out = np.empty((len(asked), 4), dtype=np.float32)
+        count = len(queries)
+        out = np.empty((count, 4), dtype=np.float32)
+        order = np.arange(min(count, PIECE), dtype=np.int32)
 
         def piece(first: int) -> None:
-            decode_range(
-                self.architecture, self.layers, self.weights, self.biases, self.code, self.rows, self.angle_row,
-                self.curvature, asked, first, min(first + PIECE, len(asked)), out,
-            )  # fmt: skip
+            columns = np.asarray(queries[first : first + PIECE], dtype=np.float32).T.ravel()
+            some = len(columns) // QUERY_COLUMNS
+            self.decode_columns(columns, some, order[:some], out[first : first + some])
 
-        starts = range(0, len(asked), PIECE)
+        starts = range(0, count, PIECE)
         if threads == 1 or len(starts) < 2:
             for first in starts:
                 piece(first)
@@ -74,12 +76,24 @@ class Plan:
                 list(pool.map(piece, starts))
         return out
 
+    def decode_columns(self, queries: Floats, stride: int, order: NDArray[np.int32], out: Floats) -> None:
+        """Components of some queries in columns (8 ``stride``,) flat: those of ``order`` (N,), into ``out`` (N, 4)."""
+        decode_range(
+            self.architecture, self.layers, self.weights, self.biases, self.code.reshape(-1), self.rows,
+            self.angle_row, self.curvature, queries, stride, order, 0, len(order), out,
+        )  # fmt: skip
+
 
 def plans_of(network: MaterialNetwork, materials: Sequence[SurfaceMaterial]) -> list[Plan]:
     """Materials ready to be asked; the encoder runs here, once."""
     tiles, parameters = material_inputs(materials)
-    with torch.inference_mode():
-        codes = network.encode(tiles, parameters)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # so little work is done before other threads have woken
+    try:
+        with torch.inference_mode():
+            codes = network.encode(tiles, parameters)
+    finally:
+        torch.set_num_threads(threads)
     return [plan_of(network, code) for code in codes]
 
 
@@ -89,6 +103,28 @@ def plan_of(network: MaterialNetwork, code: Tensor) -> Plan:
         return _lean_plan(network, code)
     assert isinstance(network, PaperNetwork)
     return _paper_plan(network, code)
+
+
+def pack_plans(plans: Sequence[Plan]) -> Decoders:
+    """Plans one after the other, for kernels that ask several."""
+    if not plans:
+        nothing = np.zeros(4, dtype=np.float32)
+        plans = [Plan(LEAN, np.zeros((1, 8), dtype=np.int64), nothing, nothing, nothing, 4, 0, 1.0)]
+    table, layers = [], []
+    ends = [0, 0, 0, 0]
+    for plan in plans:
+        sizes = (len(plan.layers), plan.code.size, plan.weights.size, plan.biases.size)
+        table.append([plan.architecture, ends[0], ends[0] + sizes[0], plan.rows, plan.angle_row, ends[1]])
+        moved = plan.layers.copy()
+        moved[:, WEIGHTS] += ends[2]
+        moved[:, BIASES] += ends[3]
+        layers.append(moved)
+        ends = [end + size for end, size in zip(ends, sizes, strict=True)]
+    return Decoders(
+        np.array(table, dtype=np.int64), np.array([plan.curvature for plan in plans]), np.concatenate(layers),
+        np.concatenate([plan.weights for plan in plans]), np.concatenate([plan.biases for plan in plans]),
+        np.concatenate([plan.code.ravel() for plan in plans]),
+    )  # fmt: skip
 
 
 class _Builder:
@@ -108,7 +144,7 @@ class _Builder:
         matrix = np.pad(matrix, ((0, 0), (0, -matrix.shape[1] % 4)))
         at = (sum(w.size for w in self.weights), sum(b.size for b in self.biases))
         self.rows.append([first, matrix.shape[1], start, matrix.shape[0], *at, int(add), int(activate)])
-        self.weights.append(matrix.ravel())
+        self.weights.append(matrix.reshape(-1, 4, matrix.shape[1]).transpose(0, 2, 1).ravel())
         self.biases.append(layer.bias.detach().numpy().astype(np.float32) if bias is None else bias)
 
     def plan(self, architecture: int, code: Floats, rows: int, angle_row: int, curvature: float) -> Plan:

@@ -1,12 +1,13 @@
 """Decoders in compiled loops over blocks of queries, without torch.
 
-A block's numbers lie as rows of ``LANES`` queries in one array, so that every loop runs over queries. A network is a
-table of layers on these rows, see ``decoder.Plan``; all numbers of inputs and outputs are multiples of 4.
+A block's numbers lie as rows of ``BLOCK`` queries in one array, and vectors run over queries. A network is a table of
+layers on these rows, see ``decoder.Plan``; all numbers of inputs and outputs are multiples of 4.
+
+Queries are columns too, (8, N) in a flat array: row r of query q at ``r * stride + q``.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -15,141 +16,195 @@ from numba import njit
 from usdfab.neural.encoding import BLOBS, LARGEST
 from usdfab.neural.lean_network import FEATURES, LEVEL_BIAS, SIDES
 from usdfab.neural.network import SLOPE
+from usdfab.neural.simd import (
+    LANES,
+    floor,
+    gather,
+    least,
+    load,
+    most,
+    root,
+    spread,
+    spread_integer,
+    store,
+    to_floats,
+    to_integers,
+    transpose,
+    where,
+)
+from usdfab.neural.simd_math import INLINE, dot, exp, log2
 
-LANES = 256
-"""Queries of a block: long enough to pay for the loops' starts, short enough for a core's own cache."""
+BLOCK = 2 * LANES
+"""Queries of a block: two vectors, so that each weight that is read is used twice."""
 
 IN_ROW, INPUTS, OUT_ROW, OUTPUTS, WEIGHTS, BIASES, ADD, ACTIVATE = range(8)
-"""Columns of the table of layers: rows read and written, where the matrix (OUTPUTS, INPUTS) and the biases start,
-whether to add to what is in the rows, whether a leaky rectifier follows."""
+"""Columns of the table of layers: rows read and written, where the matrix and the biases start, whether to add to what
+is in the rows, whether a leaky rectifier follows. Matrices are (OUTPUTS / 4, INPUTS, 4): four outputs at a time."""
 
 LEAN, PAPER = 0, 1
 
-_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "reassoc"}}
-_SLOPE = np.float32(SLOPE)
-_FINEST, _LAST = np.float32(SIDES[0]), len(SIDES) - 1
-_BIAS = np.float32(LEVEL_BIAS)
-_LARGEST = np.float32(LARGEST)
+OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "reassoc"}}
+_LAST = len(SIDES) - 1
 
 
-@njit(**_OPTIONS)
-def _layer(x, weights, biases, layer):
-    """One layer of the table on all queries of a block: four inputs to four outputs at a time, in registers."""
-    first, inputs, start, outputs = layer[IN_ROW], layer[INPUTS], layer[OUT_ROW], layer[OUTPUTS]
-    for o in range(0, outputs, 4):
-        r = start + o
-        b = layer[BIASES] + o
-        b0, b1, b2, b3 = biases[b], biases[b + 1], biases[b + 2], biases[b + 3]
-        if layer[ADD]:
-            for k in range(LANES):
-                x[r, k] += b0
-                x[r + 1, k] += b1
-                x[r + 2, k] += b2
-                x[r + 3, k] += b3
-        else:
-            for k in range(LANES):
-                x[r, k] = b0
-                x[r + 1, k] = b1
-                x[r + 2, k] = b2
-                x[r + 3, k] = b3
-        for i in range(0, inputs, 4):
-            w = layer[WEIGHTS] + o * inputs + i
-            w00, w01, w02, w03 = weights[w], weights[w + 1], weights[w + 2], weights[w + 3]
-            w += inputs
-            w10, w11, w12, w13 = weights[w], weights[w + 1], weights[w + 2], weights[w + 3]
-            w += inputs
-            w20, w21, w22, w23 = weights[w], weights[w + 1], weights[w + 2], weights[w + 3]
-            w += inputs
-            w30, w31, w32, w33 = weights[w], weights[w + 1], weights[w + 2], weights[w + 3]
-            q = first + i
-            for k in range(LANES):
-                a, b_, c, d = x[q, k], x[q + 1, k], x[q + 2, k], x[q + 3, k]
-                x[r, k] += w00 * a + w01 * b_ + w02 * c + w03 * d
-                x[r + 1, k] += w10 * a + w11 * b_ + w12 * c + w13 * d
-                x[r + 2, k] += w20 * a + w21 * b_ + w22 * c + w23 * d
-                x[r + 3, k] += w30 * a + w31 * b_ + w32 * c + w33 * d
-        if layer[ACTIVATE]:
-            for row in range(r, r + 4):
-                for k in range(LANES):
-                    x[row, k] = max(x[row, k], _SLOPE * x[row, k])
+@njit(**INLINE)
+def _rectified(x):
+    return most(x, x * SLOPE)
 
 
-@njit(**_OPTIONS)
-def _lean_inputs(x, found, code, queries, start, count):
+@njit(**INLINE)
+def _layer(x, weights, biases, first, inputs, start, outputs, w, b, add, activate):
+    """One layer of the table on all queries of a block: four outputs of two vectors at a time, in registers."""
+    for r in range(start * BLOCK, (start + outputs) * BLOCK, 4 * BLOCK):
+        a0 = a1 = spread(biases[b])
+        b0 = b1 = spread(biases[b + 1])
+        c0 = c1 = spread(biases[b + 2])
+        d0 = d1 = spread(biases[b + 3])
+        b += 4
+        if add:
+            a0, a1 = a0 + load(x, r), a1 + load(x, r + LANES)
+            b0, b1 = b0 + load(x, r + BLOCK), b1 + load(x, r + BLOCK + LANES)
+            c0, c1 = c0 + load(x, r + 2 * BLOCK), c1 + load(x, r + 2 * BLOCK + LANES)
+            d0, d1 = d0 + load(x, r + 3 * BLOCK), d1 + load(x, r + 3 * BLOCK + LANES)
+        for q in range(first * BLOCK, (first + inputs) * BLOCK, BLOCK):
+            x0, x1 = load(x, q), load(x, q + LANES)
+            k = weights[w]
+            a0, a1 = a0 + x0 * k, a1 + x1 * k
+            k = weights[w + 1]
+            b0, b1 = b0 + x0 * k, b1 + x1 * k
+            k = weights[w + 2]
+            c0, c1 = c0 + x0 * k, c1 + x1 * k
+            k = weights[w + 3]
+            d0, d1 = d0 + x0 * k, d1 + x1 * k
+            w += 4
+        if activate:
+            a0, a1, b0, b1 = _rectified(a0), _rectified(a1), _rectified(b0), _rectified(b1)
+            c0, c1, d0, d1 = _rectified(c0), _rectified(c1), _rectified(d0), _rectified(d1)
+        store(x, r, a0)
+        store(x, r + LANES, a1)
+        store(x, r + BLOCK, b0)
+        store(x, r + BLOCK + LANES, b1)
+        store(x, r + 2 * BLOCK, c0)
+        store(x, r + 2 * BLOCK + LANES, c1)
+        store(x, r + 3 * BLOCK, d0)
+        store(x, r + 3 * BLOCK + LANES, d1)
+
+
+@njit(**INLINE)
+def _corner(texels, shares, slot, level, u, v, share):
+    """The four texels about a footprint's place on a level (``lean_network._corners``), and what each counts."""
+    side = spread_integer(SIDES[0]) >> level
+    first = to_integers((to_floats(spread_integer(SIDES[0] ** 2) - side * side)) * (4.0 / 3.0) + 0.5)
+    px, py = u * to_floats(side) - 0.5, v * to_floats(side) - 0.5
+    left, low = floor(px), floor(py)
+    fx, fy = px - left, py - low
+    c0, r0 = to_integers(left) & (side - 1), to_integers(low) & (side - 1)
+    c1, r1 = (c0 + 1) & (side - 1), (r0 + 1) & (side - 1)
+    a, b = first + r0 * side, first + r1 * side
+    gx, gy = share * (1.0 - fx), 1.0 - fy
+    fx = share * fx
+    store(texels, slot, (a + c0) * FEATURES)
+    store(texels, slot + LANES, (a + c1) * FEATURES)
+    store(texels, slot + 2 * LANES, (b + c0) * FEATURES)
+    store(texels, slot + 3 * LANES, (b + c1) * FEATURES)
+    store(shares, slot, gx * gy)
+    store(shares, slot + LANES, fx * gy)
+    store(shares, slot + 2 * LANES, gx * fy)
+    store(shares, slot + 3 * LANES, fx * fy)
+
+
+@njit(**INLINE)
+def _lean_inputs(x, half, found, texels, shares, code, u, v, size, ix, iy, iz, ox, oy):
     """Rows 0 to 15: features of the pyramid; 16 to 23: directions and half vector (``encoding.angles``)."""
-    for k in range(count):
-        u, v, size = queries[start + k, 0], queries[start + k, 1], queries[start + k, 2]
-        level = math.log2(max(size, np.float32(1e-6)) * _FINEST) - _BIAS
-        level = min(max(level, np.float32(0.0)), np.float32(_LAST))
-        lower = min(int(level), _LAST - 1)
-        between = np.float32(level - lower)
-        for channel in range(FEATURES):
-            found[channel] = np.float32(0.0)
-        for step in range(2):
-            share = between if step == 1 else np.float32(1.0) - between
-            number = lower + step
-            side = SIDES[0] >> number
-            first = 4 * (SIDES[0] * SIDES[0] - side * side) // 3  # texels of the levels before
-            px, py = u * np.float32(side) - np.float32(0.5), v * np.float32(side) - np.float32(0.5)
-            left, low = math.floor(px), math.floor(py)
-            fx, fy = np.float32(px - left), np.float32(py - low)
-            c0, r0 = int(left) & (side - 1), int(low) & (side - 1)
-            c1, r1 = (c0 + 1) & (side - 1), (r0 + 1) & (side - 1)
-            a, b = first + r0 * side, first + r1 * side
-            gx, gy = np.float32(1.0) - fx, np.float32(1.0) - fy
-            s0, s1, s2, s3 = share * gx * gy, share * fx * gy, share * gx * fy, share * fx * fy
-            for channel in range(FEATURES):
-                low_pair = s0 * code[a + c0, channel] + s1 * code[a + c1, channel]
-                found[channel] += low_pair + s2 * code[b + c0, channel] + s3 * code[b + c1, channel]
-        for channel in range(FEATURES):
-            x[channel, k] = found[channel]
-    for k in range(count):
-        q = start + k
-        ix, iy, iz, ox, oy = queries[q, 3], queries[q, 4], queries[q, 5], queries[q, 6], queries[q, 7]
-        oz = math.sqrt(max(np.float32(1.0) - ox * ox - oy * oy, np.float32(0.0)))
-        hx, hy, hz = ix + ox, iy + oy, iz + oz
-        norm = np.float32(1.0 / max(math.sqrt(hx * hx + hy * hy + hz * hz), 1e-6))
-        x[16, k], x[17, k], x[18, k], x[19, k], x[20, k] = ix, iy, iz, ox, oy
-        x[21, k], x[22, k], x[23, k] = hx * norm, hy * norm, hz * norm
+    level = least(most(log2(most(size, 1e-6) * SIDES[0]) - LEVEL_BIAS, 0.0), float(_LAST))
+    lower = least(floor(level), _LAST - 1.0)
+    between, number = level - lower, to_integers(lower)
+    _corner(texels, shares, 0, number, u, v, 1.0 - between)
+    _corner(texels, shares, 4 * LANES, number + 1, u, v, between)
+    for lane in range(LANES):
+        total = load(code, texels[lane]) * shares[lane]
+        for k in range(LANES + lane, 8 * LANES, LANES):
+            total = total + load(code, texels[k]) * shares[k]
+        store(found, lane * FEATURES, total)
+    transpose(found, 0, x, half, BLOCK)
+    oz = root(most(1.0 - ox * ox - oy * oy, 0.0))
+    hx, hy, hz = ix + ox, iy + oy, iz + oz
+    norm = 1.0 / most(root(dot(hx, hy, hz, hx, hy, hz)), 1e-6)
+    row = FEATURES * BLOCK + half
+    store(x, row, ix)
+    store(x, row + BLOCK, iy)
+    store(x, row + 2 * BLOCK, iz)
+    store(x, row + 3 * BLOCK, ox)
+    store(x, row + 4 * BLOCK, oy)
+    store(x, row + 5 * BLOCK, hx * norm)
+    store(x, row + 6 * BLOCK, hy * norm)
+    store(x, row + 7 * BLOCK, hz * norm)
 
 
-@njit(**_OPTIONS)
-def _paper_inputs(x, angle_row, queries, start, count):
+@njit(**INLINE)
+def _paper_inputs(x, half, angle_row, u, v, size, ix, iy, iz, ox, oy):
     """Rows 0 to 23: one-blobs of the footprint (``encoding.encoded_footprint``); from ``angle_row`` on directions."""
-    for k in range(count):
-        q = start + k
-        size = math.sqrt(min(max(queries[q, 2], np.float32(0.0)), _LARGEST) / _LARGEST)
-        for blob in range(BLOBS):
-            middle = np.float32((blob + 0.5) / BLOBS)
-            for part in range(3):
-                away = (size if part == 2 else queries[q, part]) - middle
-                if part < 2:
-                    away -= np.float32(round(away))
-                away *= np.float32(BLOBS)
-                x[part * BLOBS + blob, k] = math.exp(np.float32(-0.5) * away * away)
-        for column in range(5):
-            x[angle_row + column, k] = queries[q, 3 + column]
+    side = root(least(most(size, 0.0), LARGEST) * (1.0 / LARGEST))
+    for blob in range(BLOBS):
+        middle = (blob + 0.5) / BLOBS
+        for part in range(3):
+            away = side - middle
+            if part < 2:
+                away = (u if part == 0 else v) - middle
+                away = away - floor(away + 0.5)
+            away = away * float(BLOBS)
+            store(x, (part * BLOBS + blob) * BLOCK + half, exp(away * away * -0.5))
+    row = angle_row * BLOCK + half
+    store(x, row, ix)
+    store(x, row + BLOCK, iy)
+    store(x, row + 2 * BLOCK, iz)
+    store(x, row + 3 * BLOCK, ox)
+    store(x, row + 4 * BLOCK, oy)
 
 
-@njit(**_OPTIONS)
-def decode_range(architecture, layers, weights, biases, code, rows, angle_row, curvature, queries, first, last, out):
-    """Components of queries ``first`` to ``last`` into ``out`` (N, 4) float32; none below 0."""
-    x = np.zeros((rows, LANES), dtype=np.float32)
-    found = np.zeros(FEATURES, dtype=np.float32)
-    result = layers[-1, OUT_ROW]
-    scale = np.float32(1.0 / curvature)
-    for start in range(first, last, LANES):
-        count = min(LANES, last - start)
-        if architecture == LEAN:
-            _lean_inputs(x, found, code, queries, start, count)
-        else:
-            _paper_inputs(x, angle_row, queries, start, count)
-        for number in range(len(layers)):
-            _layer(x, weights, biases, layers[number])
+@njit(**OPTIONS)
+def decode_range(
+    architecture, layers, weights, biases, code, rows, angle_row, curvature, queries, stride, order, first, last, out
+):
+    """Components of queries ``order[first:last]`` into rows ``first`` to ``last`` of ``out`` (N, 4) float32, none < 0.
+
+    Parameters
+    ----------
+    queries: (8 stride,) float32
+        In columns.
+    order: (N,) int32
+        Which are asked.
+    """
+    x = np.zeros(rows * BLOCK, dtype=np.float32)
+    found = np.zeros(LANES * FEATURES, dtype=np.float32)
+    texels, shares = np.zeros(8 * LANES, dtype=np.int32), np.zeros(8 * LANES, dtype=np.float32)
+    block = np.zeros(BLOCK, dtype=np.int32)
+    result = layers[-1, OUT_ROW] * BLOCK
+    scale = 1.0 / curvature
+    for start in range(first, last, BLOCK):
+        count = min(BLOCK, last - start)
+        for k in range(BLOCK):
+            block[k] = order[start + min(k, count - 1)]
+        for half in range(0, BLOCK, LANES):
+            q = load(block, half)
+            u, v, size = gather(queries, q), gather(queries, q + stride), gather(queries, q + 2 * stride)
+            ix, iy = gather(queries, q + 3 * stride), gather(queries, q + 4 * stride)
+            iz, ox = gather(queries, q + 5 * stride), gather(queries, q + 6 * stride)
+            oy = gather(queries, q + 7 * stride)
+            if architecture == LEAN:
+                _lean_inputs(x, half, found, texels, shares, code, u, v, size, ix, iy, iz, ox, oy)
+            else:
+                _paper_inputs(x, half, angle_row, u, v, size, ix, iy, iz, ox, oy)
+        for n in range(len(layers)):
+            _layer(
+                x, weights, biases, layers[n, IN_ROW], layers[n, INPUTS], layers[n, OUT_ROW], layers[n, OUTPUTS],
+                layers[n, WEIGHTS], layers[n, BIASES], layers[n, ADD] != 0, layers[n, ACTIVATE] != 0,
+            )  # fmt: skip
+        for r in range(result, result + 2 * BLOCK, LANES):
+            store(x, r, most(load(x, r), 0.0))
+        for r in range(result + 2 * BLOCK, result + 4 * BLOCK, LANES):
+            value = load(x, r)
+            store(x, r, where(value > 0.0, (exp(value) - 1.0) * scale, 0.0))
         for k in range(count):
-            for column in range(2):
-                out[start + k, column] = max(x[result + column, k], np.float32(0.0))
-                value = x[result + 2 + column, k]
-                out[start + k, 2 + column] = (
-                    (math.exp(value) - np.float32(1.0)) * scale if value > np.float32(0.0) else np.float32(0.0)
-                )
+            for column in range(4):
+                out[start + k, column] = x[result + column * BLOCK + k]

@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
-from usdfab.neural.decoder import Plan, plans_of
+from usdfab.neural.cloth_scene import has_bodies, pack_cloth
+from usdfab.neural.decoder import Plan, pack_plans, plans_of
+from usdfab.neural.gbuffer import Cloth
 from usdfab.neural.material_file import Weights
+from usdfab.neural.strips import Decoders
 from usdfab.neural.surface_from_fabric import surface_from_fabric
 from usdfab.neural.surface_material import PAPER_GAP, SurfaceMaterial
 from usdfab.tracer import embree
@@ -50,21 +53,26 @@ class NeuralScene:
 
     Parameters
     ----------
+    materials: 2 to each fabric
+        Front and back, as the networks know them.
     plans: 4 to each fabric
         Front lit from the front, from behind; back lit from its own front, from behind.
     albedo: (fabrics, 2, 4, 3)
         Of C_warp, C_weft, S_warp, S_weft, for light from the front and from behind.
-    mips, repeats:
-        See ``gbuffer.fill``.
+    decoders:
+        The plans for the compiled driver; None: ``plans`` are asked one by one.
+    cloth:
+        See ``gbuffer.Cloth``.
     embree:
         Keeps the meshes alive.
     """
 
     world: World
+    materials: list[SurfaceMaterial]
     plans: list[Plan]
-    albedo: NDArray[np.float64]
-    mips: NDArray[np.int32]
-    repeats: NDArray[np.float64]
+    decoders: Decoders | None
+    albedo: NDArray[np.float32]
+    cloth: Cloth
     lights: list[PlacedLight]
     embree: EmbreeScene
     warnings: tuple[str, ...]
@@ -117,6 +125,18 @@ def build(
         if material.fabric < 0 and (np.any(material.emissive) or "emissiveColor" in material.textures):
             left_out("a surface that glows lights nothing in the neural backend", material.path)
     _check_uv(scene)
+    materials, albedo = materials_of(scene)
+    return _assemble(scene, materials, asked_plans(materials, networks), albedo, [*warnings], pictures, strict)
+
+
+def materials_of(scene: Scene) -> tuple[list[SurfaceMaterial], NDArray[np.float32]]:
+    """Front and back of a scene's fabrics as the networks know them, and ``albedo`` of ``NeuralScene``.
+
+    Raises
+    ------
+    UsdfabError
+        If a weave is larger than the encoder takes.
+    """
     materials: list[SurfaceMaterial] = []
     albedo = np.zeros((len(scene.fabrics), 2, 4, 3))
     for number, surface in enumerate(scene.fabrics):
@@ -129,11 +149,39 @@ def build(
             )  # fmt: skip
         materials += [cloth, reversed_material(cloth)]
         albedo[number] = cover * np.stack([colors.reflection, colors.transmission])
-    plans: list[Plan] = []
-    if materials:
-        both = [plans_of(networks[kind].network, materials) for kind in ("reflection", "transmission")]
-        plans = [both[kind][k] for k in range(len(materials)) for kind in (0, 1)]
-    return _assemble(scene, plans, albedo, [*warnings], pictures, strict)
+    return materials, albedo.astype(np.float32)
+
+
+def asked_plans(materials: Sequence[SurfaceMaterial], networks: Mapping[str, Weights]) -> list[Plan]:
+    """``plans`` of ``NeuralScene``; the encoders run here."""
+    if not materials:
+        return []
+    both = [plans_of(networks[kind].network, materials) for kind in ("reflection", "transmission")]
+    return [both[kind][k] for k in range(len(materials)) for kind in (0, 1)]
+
+
+def dressed(ready: NeuralScene, scene: Scene, networks: Mapping[str, Weights]) -> NeuralScene:
+    """A scene with its fabrics changed: their yarns, colours and weaves, nothing else. Takes milliseconds."""
+    materials, albedo = materials_of(scene)
+    if [_identity(m) for m in materials] != [_identity(m) for m in ready.materials]:
+        plans = asked_plans(materials, networks)
+        ready = replace(ready, materials=materials, plans=plans, decoders=pack_plans(plans))
+    return replace(ready, albedo=albedo, cloth=pack_cloth(scene, ready.world, ready.cloth.mips))
+
+
+def relit(ready: NeuralScene, scene: Scene, pictures: Mapping[str, NDArray]) -> NeuralScene:
+    """A scene with other lights."""
+    world = ready.world._replace(lights=pack_lights(scene, dict(pictures)))
+    cloth = ready.cloth._replace(bodies=has_bodies(world))
+    return replace(ready, world=world, cloth=cloth, lights=_placed(scene, pictures))
+
+
+def _identity(material: SurfaceMaterial) -> tuple:
+    """All that an encoder sees of a material."""
+    return (
+        material.weave.shape, material.weave.tobytes(), material.twist, material.inclination, material.roughness,
+        material.height_scale, material.gap,
+    )  # fmt: skip
 
 
 def _check_uv(scene: Scene) -> None:
@@ -146,8 +194,8 @@ def _check_uv(scene: Scene) -> None:
 
 
 def _assemble(
-    scene: Scene, plans: list[Plan], albedo: NDArray[np.float64], warnings: list[str],
-    pictures: Mapping[str, NDArray], strict: bool,
+    scene: Scene, materials: list[SurfaceMaterial], plans: list[Plan], albedo: NDArray[np.float32],
+    warnings: list[str], pictures: Mapping[str, NDArray], strict: bool,
 ) -> NeuralScene:  # fmt: skip
     maps = [surface.albedo_map for surface in scene.fabrics]
     wanted = [t for m in scene.materials if m.fabric < 0 for t in m.textures.values()] + [m for m in maps if m]
@@ -171,15 +219,17 @@ def _assemble(
         macro, pack_patches([]), rows, pack_textures(used, images), pack_lights(scene, dict(pictures)),
         addresses,  # type: ignore[arg-type]
     )  # fmt: skip
-    repeats = np.ones((max(len(scene.fabrics), 1), 2))
-    for row, surface in zip(repeats, scene.fabrics, strict=False):
-        fabric = surface.fabric
-        row[:] = fabric.cell[0] * fabric.weave.ends, fabric.cell[1] * fabric.weave.picks
-    lights = [
+    return NeuralScene(
+        world, materials, plans, pack_plans(plans), albedo, pack_cloth(scene, world, mips),
+        _placed(scene, pictures), embree_scene, (*warnings, *said, *more),
+    )  # fmt: skip
+
+
+def _placed(scene: Scene, pictures: Mapping[str, NDArray]) -> list[PlacedLight]:
+    return [
         PlacedLight(pack_lights(replace(scene, lights=(light,)), dict(pictures)), _places(light))
         for light in scene.lights
     ]
-    return NeuralScene(world, plans, albedo, mips, repeats, lights, embree_scene, (*warnings, *said, *more))
 
 
 def _places(light: Light) -> int:

@@ -170,6 +170,14 @@ def packet_address() -> int:
     return address
 
 
+@_once
+def packet_shadow_address() -> int:
+    """Address of ``rtcOccluded16`` (valid, scene, rays, arguments)."""
+    address = ctypes.cast(library().rtcOccluded16, ctypes.c_void_p).value
+    assert address is not None
+    return address
+
+
 class EmbreeScene:
     """A committed Embree scene. Keeps its buffers alive; freed with the object.
 
