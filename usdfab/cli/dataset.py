@@ -31,8 +31,8 @@ def fabrics(
     prior: Annotated[
         str, Parameter(help="paper (Table 4 of Li et al. 2024), wide (as real photos show cloth) or both in turn.")
     ] = "both",
-    size: Annotated[int, Parameter(help="Pixels on a side.")] = 256,
-    spp: Annotated[int, Parameter(help="Samples per pixel.")] = 8,
+    size: Annotated[int, Parameter(help="Pixels on a side.")] = 320,
+    spp: Annotated[int, Parameter(help="Samples per pixel. One at more pixels tells more than several at few.")] = 1,
     denoise: Annotated[bool, Parameter(help="Remove the noise; the picture's mean is kept.")] = True,
     shard: Annotated[int, Parameter(help="Samples in each tar file.")] = 256,
     seed: Seed = 0,

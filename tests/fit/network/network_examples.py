@@ -15,6 +15,7 @@ from usdfab.fit.dataset.samples import draw_sample
 from usdfab.fit.dataset.settings import Settings
 from usdfab.fit.dataset.store import Store
 from usdfab.fit.features import FeatureNet
+from usdfab.fit.network.detail import DETAIL_SIZE
 from usdfab.fit.network.inputs import Basis
 from usdfab.fit.network.labels import LABELS
 from usdfab.fit.network.spectra import BINS, FREQUENCIES, LATTICE_SIZE
@@ -36,7 +37,7 @@ def basis() -> Basis:
 
 
 def rows(samples: int = 60, views: int = 2, seed: int = 0) -> Rows:
-    """Rows in which the lattice tells the weave and the irregularity, and a peak of the spectra the counts."""
+    """Rows: the lattice tells the weave, lattice and detail the irregularity, a peak of the spectra the counts."""
     rng = np.random.default_rng(seed)
     count = samples * views
     index = np.repeat(np.arange(samples), views)
@@ -56,7 +57,12 @@ def rows(samples: int = 60, views: int = 2, seed: int = 0) -> Rows:
         covariance = np.einsum("bni,bnj->bij", parts, parts) / 20
         rows_, columns = np.triu_indices(q)
         texture += [middle, covariance[:, rows_, columns]]
-    as_float = {"texture": np.concatenate(texture, axis=1), "spectra": spectra, "lattice": lattice, "values": values}
+    vector = np.concatenate(texture, axis=1)
+    signs = np.random.default_rng(6).normal(size=(2, DETAIL_SIZE))
+    detail = rng.normal(size=(count, DETAIL_SIZE)) + values[:, :, 9] @ signs
+    as_float = {
+        "texture": vector, "whole": vector, "detail": detail, "spectra": spectra, "lattice": lattice, "values": values
+    }  # fmt: skip
     return Rows(
         index=torch.from_numpy(index),
         number=torch.arange(count) % views,

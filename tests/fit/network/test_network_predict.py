@@ -17,7 +17,8 @@ from usdfab.fit.network import predict as predicting, stage
 from usdfab.fit.network.fit import fit_network
 from usdfab.fit.network.labels import LABELS
 from usdfab.fit.network.network_file import Weights
-from usdfab.fit.network.predict import Guess, predict, turned_back, values_back
+from usdfab.fit.network.predict import Guess, likeliest, predict, turned_back, values_back
+from usdfab.fit.network.spectra import FREQUENCIES
 from usdfab.fit.network.targets import INDEX
 from usdfab.fit.network.training import TrainSettings
 from usdfab.fit.network.turns import Turn
@@ -52,6 +53,13 @@ def test_probabilities_and_counts(guess: Guess) -> None:
         assert min(abs(count / truth - 1.0), abs(count / (2.0 * truth) - 1.0)) < 0.05
     np.testing.assert_allclose(np.exp(guess.values[:, INDEX["count"]]), guess.counts)
     assert (guess.sigma > 0.0).all() and ((guess.count_confidence >= 0.0) & (guess.count_confidence <= 1.0)).all()
+
+
+def test_the_likeliest_count_lies_between_bins() -> None:
+    for truth in (6.3, 17.7):
+        odds = np.stack([np.exp(-0.5 * ((np.log(FREQUENCIES) - np.log(c)) / 0.02) ** 2) for c in (truth, 30.0)])
+        odds[:, :9] += 0.3 * odds.max()
+        assert likeliest(odds) == pytest.approx([truth, 30.0], rel=2e-3)
 
 
 def test_a_turned_photo_gives_the_turned_guess(

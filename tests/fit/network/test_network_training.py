@@ -43,8 +43,8 @@ def test_it_learns_what_the_inputs_hold_and_nothing_else(trained: Weights) -> No
     network, test = trained.network, rows(80, seed=9)
     assert isinstance(network, Robust)
     with torch.no_grad():
-        x = network.reduced(test.texture, test.lattice)
-        spread = network.standardised(network.number_estimates(x, test.values[:, :, 0])[0]).std(dim=(0, 1))
+        x = network.reduced(test.texture, test.detail, test.lattice)
+        spread = network.standardised(network.number_estimates(x, test.values[:, :, 0], test.table4)[0]).std(dim=(0, 1))
     assert float(spread[INDEX["crimp"]]) < 0.3 < float(spread[INDEX["irregularity"]])
     curve = trained.about["learning_curve"]
     sizes = sorted(map(int, curve))
@@ -56,11 +56,28 @@ def test_calibrated_deviations_cover_two_thirds(trained: Weights) -> None:
     network, test = trained.network, rows(120, seed=11)
     assert isinstance(network, Robust)
     with torch.no_grad():
-        x = network.reduced(test.texture, test.lattice)
-        mean, deviation = network.number_estimates(x, test.values[:, :, 0])
+        x = network.reduced(test.texture, test.detail, test.lattice)
+        mean, deviation = network.number_estimates(x, test.values[:, :, 0], test.table4)
     z = ((mean - test.values) / deviation)[:, :, 1:]
     inside = (z.abs() < 1.0).float().mean(dim=(0, 1))
     assert 0.6 < float(inside.mean()) < 0.76 and float(inside.min()) > 0.5
+
+
+def test_each_prior_is_calibrated_by_itself(trained: Weights) -> None:
+    """Fabrics that differ less than the others are brought near their own mean."""
+    network, test = trained.network, rows(120, seed=13)
+    assert isinstance(network, Robust)
+    k = INDEX["crimp"]
+    test.values[:, :, k] = torch.where(test.table4[:, None], 2.0 + 0.01 * test.values[:, :, k], test.values[:, :, k])
+    before = calibrate(network, rows(120, seed=12))
+    assert set(calibrate(network, test)) == set(before)
+    with torch.no_grad():
+        x = network.reduced(test.texture, test.detail, test.lattice)
+        mean, deviation = network.number_estimates(x, test.values[:, :, 0], test.table4)
+    wanted = test.values[test.table4][..., k]
+    assert float((mean[test.table4][..., k] - wanted).square().mean().sqrt()) < 0.02
+    assert float(deviation[test.table4][..., k].mean()) < 0.02 < 0.5 < float(deviation[~test.table4][..., k].mean())
+    calibrate(network, rows(120, seed=12))
 
 
 def test_calibration_finds_a_known_overconfidence(trained: Weights) -> None:
@@ -144,7 +161,7 @@ def test_the_paper_model_learns_from_renders_of_table_4_alone() -> None:
     fitted = fit_network(prepared_rows(), TrainSettings("paper", epochs=3))
     network = fitted.weights.network
     with torch.no_grad():
-        logits, found = network(rows().texture)
+        logits, found = network(rows().whole)
     assert logits.shape == (120, 7) and found.shape == (120, 28)
     assert float(found.min()) >= 0.0 and float(found.max()) <= 1.0
     assert set(quick_errors(fitted.weights, rows())) == {"weave"}
@@ -206,7 +223,7 @@ def test_drawn_cloth_teaches_counts_and_weave() -> None:
     assert fitted.weights.about["data"]["drawn"] == 300
     network = fitted.weights.network
     assert isinstance(network, Robust)
-    x = torch.ones(2, 192)
+    x = torch.ones(2, 320)
     found = network.blinded(x, torch.tensor([True, False]))
     assert found[0, :128].abs().sum() == 0 and found[0, 128:].eq(1).all() and found[1].eq(1).all()
 

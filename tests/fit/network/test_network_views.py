@@ -17,7 +17,7 @@ from usdfab.fabric.weave import NAMED_WEAVES, PAPER_WEAVES, twill
 from usdfab.fit.network.labels import FAMILIES, LABELS, family_of, typical_weave, weave_label
 from usdfab.fit.network.targets import INDEX, NAMES, TARGETS, decode, encode
 from usdfab.fit.network.turns import TURNS, Turn, cropped, recolored
-from usdfab.fit.network.unevenness import Unevenness, sample_unevenness, uneven
+from usdfab.fit.network.unevenness import Unevenness, _smooth_noise, sample_unevenness, uneven
 from usdfab.fit.network.views import view
 
 
@@ -93,11 +93,23 @@ def test_uneven_cloth_keeps_its_mean_spacing() -> None:
     assert 0.0 <= sample_unevenness(np.random.default_rng(1)).bend <= 0.5
 
 
+def test_bent_cloth_keeps_its_count() -> None:
+    for seed in range(5):
+        noise = _smooth_noise((40, 60), np.random.default_rng(seed))
+        for axis in (0, 1):
+            slope = np.polyfit(np.arange(noise.shape[axis]), noise.mean(axis=1 - axis), 1)[0]
+            assert slope == pytest.approx(0.0, abs=1e-12)
+        assert 0.4 < noise.std() < 1.6
+
+
 def test_views_are_the_same_each_time_and_the_first_is_the_render() -> None:
     fabric = sample_fabric("twill0", np.random.default_rng(1))
     pixels = np.random.default_rng(2).uniform(0.0, 1.0, (64, 64, 3)).astype(np.float32)
     plain, same = view(pixels, fabric, 7, 0)
     assert same == fabric and plain.shape == (256, 256, 3)
+    # Even views have seen no camera: a grey render stays grey.
+    clean, _ = view(np.full_like(pixels, 0.5), fabric, 7, 2)
+    np.testing.assert_allclose(clean, clean[0, 0, 0], rtol=1e-4)
     again = [view(pixels, fabric, 7, 3) for _ in range(2)]
     np.testing.assert_array_equal(again[0][0], again[1][0])
     assert again[0][1] == again[1][1]

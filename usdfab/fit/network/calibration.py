@@ -25,38 +25,44 @@ def calibrate(network: Robust, rows: Rows) -> dict[str, float]:
 
     Notes
     -----
-    Numbers are judged on fabrics of the wide prior, or all where there are none; counts and weave on all.
+    Numbers are calibrated for fabrics of the wide prior and of Table 4 by themselves, by all where there are none of
+    them; the skill is the wide prior's. Counts and weave are judged on all.
     """
     with torch.no_grad():
+        network.centre.zero_()
         for name in ("shrinkage", "widening", "weave_temperature", "count_temperature"):
             getattr(network, name).fill_(1.0)
-        x = network.reduced(rows.texture, rows.lattice)
+        x = network.reduced(rows.texture, rows.detail, rows.lattice)
         logits = network.counts(rows.spectra)
         goal = bin_targets(rows.values[:, :, 0])
         losses = [float(-(goal * (t * logits).log_softmax(dim=2)).sum(dim=2).mean()) for t in TEMPERATURES]
         network.count_temperature.fill_(float(TEMPERATURES[int(np.argmin(losses))]))
-        members = network.weave(x)
+        members = network.weave_outputs(x)
         losses = []
         for t in TEMPERATURES:
             chance = (t * members).softmax(dim=2).mean(dim=0)
             losses.append(float(-chance.gather(1, rows.label[:, None]).clamp(min=1e-9).log().mean()))
         network.weave_temperature.fill_(float(TEMPERATURES[int(np.argmin(losses))]))
         hint = torch.from_numpy(FREQUENCIES).log().float()[network.count_probabilities(rows.spectra).argmax(dim=2)]
-        mean, deviation = network.number_estimates(x, hint)
+        mean, deviation = network.number_estimates(x, hint, rows.table4)
         found, wanted = network.standardised(mean), network.standardised(rows.values)
         spread = deviation / network.target_scale
-        # Photos are like the wide prior's cloth. In Table 4 the weave tells much else, by how it was drawn.
         known = rows.known.float()
-        judged = known * (~rows.table4[:, None, None]).float()
-        judged = judged if judged.any() else known
-        # Least squares of the truth on the estimate, between no trust and full trust.
-        trust = (_sum(found * wanted, judged) / _sum(found * found, judged)).clamp(max=1.0)
-        network.shrinkage.copy_(trust.expand(2, -1))
-        error = trust * found - wanted
-        network.widening.copy_((_sum((error / spread).square(), judged) / _sum(judged, judged)).sqrt().expand(2, -1))
-        middle = (wanted * judged).sum(dim=(0, 1)) / judged.sum(dim=(0, 1)).clamp(min=1.0)
-        variation = _sum((wanted - middle).square(), judged)
-        skill = (_sum(error.square(), judged) / variation).sqrt()
+        for kind in (1, 0):
+            # Photos are like the wide prior's cloth. In Table 4 the weave tells much else, by how it was drawn.
+            judged = known * (rows.table4 == bool(kind))[:, None, None].float()
+            judged = judged if judged.any() else known
+            middle = (wanted * judged).sum(dim=(0, 1)) / judged.sum(dim=(0, 1)).clamp(min=1.0)
+            # Least squares of the truth on the estimate, between no trust and full trust.
+            trust = (
+                _sum((found - middle) * (wanted - middle), judged) / _sum((found - middle).square(), judged)
+            ).clamp(max=1.0)
+            error = middle + trust * (found - middle) - wanted
+            network.centre[kind] = middle
+            network.shrinkage[kind] = trust
+            network.widening[kind] = (_sum((error / spread).square(), judged) / _sum(judged, judged)).sqrt()
+        # Those of the wide prior, which came last.
+        skill = (_sum(error.square(), judged) / _sum((wanted - middle).square(), judged)).sqrt()
     return dict(zip(NAMES, [round(float(s), 4) for s in skill], strict=True))
 
 

@@ -163,7 +163,7 @@ def _judge(
     deviations = sigmas = np.full(truth.shape, np.nan)
     guess: Guess | None = None
     if isinstance(weights.network, Robust):
-        guess = predict(photo, weights, net)
+        guess = predict(photo, weights, net, table4=table4)
         labels["network"], found["network"] = guess.label, guess.natural()
         targets["network"] = guess.values
         deviations = np.where(known, (guess.values - truth) / guess.sigma, np.nan)

@@ -97,11 +97,11 @@ def quick_errors(weights: Weights, rows: Rows) -> dict[str, float]:
     with torch.no_grad():
         if not isinstance(network, Robust):
             rows = rows.where(rows.table4 & (rows.number == 0))
-            return {"weave": float((network(rows.texture)[0].argmax(dim=1) != rows.label).float().mean())}
-        x = network.reduced(rows.texture, rows.lattice)
+            return {"weave": float((network(rows.whole)[0].argmax(dim=1) != rows.label).float().mean())}
+        x = network.reduced(rows.texture, rows.detail, rows.lattice)
         counts = torch.from_numpy(FREQUENCIES).log().float()[network.count_probabilities(rows.spectra).argmax(dim=2)]
         wrong = (counts - rows.values[:, :, 0]).abs() > 0.05
-        mean, _ = network.number_estimates(x, counts)
+        mean, _ = network.number_estimates(x, counts, rows.table4)
         known = rows.known.float()
         error = ((network.standardised(mean) - network.standardised(rows.values)).square() * known).sum(dim=(0, 1))
         rms = (error / known.sum(dim=(0, 1)).clamp(min=1.0)).sqrt()[1:]

@@ -2,8 +2,8 @@
 
 ``robust`` has three parts that learn by themselves. *Counts*: convolutions along the logarithmic frequency axis, for
 which another scale is a shift. *Weave*: from the spectrum of the lattice, in which all scales are alike, and the
-texture. *Numbers*: mean and variance of every target, from texture, lattice and counts. Weave and numbers are small
-ensembles whose members differ by chance. All know the symmetry of cloth by seeing every sample in eight turns.
+texture. *Numbers*: mean and variance of every target, from texture, detail, lattice and counts. Weave and numbers are
+small ensembles whose members differ by chance. All know the symmetry of cloth by seeing samples in eight turns.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from usdfab.fit.network.detail import DETAIL_SIZE, folded
 from usdfab.fit.network.inputs import even, gram
 from usdfab.fit.network.labels import LABELS
 from usdfab.fit.network.spectra import BIN_WIDTH, FREQUENCIES, LATTICE_SIZE
@@ -23,6 +24,7 @@ from usdfab.fit.network.targets import INDEX, TARGETS
 
 TEXTURE_COMPONENTS = 128
 LATTICE_COMPONENTS = 64
+DETAIL_COMPONENTS = 128
 HIDDEN = 96
 MEMBERS = 4
 """Of each ensemble."""
@@ -126,6 +128,7 @@ class Robust(nn.Module):
     parts = ("counts", "weave", "numbers")
     target_mean: Tensor
     target_scale: Tensor
+    centre: Tensor
     shrinkage: Tensor
     widening: Tensor
     weave_temperature: Tensor
@@ -139,19 +142,23 @@ class Robust(nn.Module):
         self.lattice = Reduced(LATTICE_SIZE, LATTICE_COMPONENTS)
         self.register_buffer("target_mean", torch.zeros(2, len(TARGETS)))
         self.register_buffer("target_scale", torch.ones(2, len(TARGETS)))
+        self.detail = Reduced(DETAIL_SIZE, DETAIL_COMPONENTS)
         inside = TEXTURE_COMPONENTS + LATTICE_COMPONENTS
         self.counts = Counts()
         self.weave = Ensemble(inside, HIDDEN, len(LABELS), MEMBERS, 0.3)
-        self.numbers = Ensemble(inside + 2, HIDDEN, 2 * outputs, MEMBERS, 0.2)
+        self.numbers = Ensemble(inside + DETAIL_COMPONENTS + 3, HIDDEN, 2 * outputs, MEMBERS, 0.2)
         # Set by calibration on pictures that were not learned from.
-        self.register_buffer("shrinkage", torch.ones(2, len(TARGETS)))
-        self.register_buffer("widening", torch.ones(2, len(TARGETS)))
+        # For the wide prior and for Table 4: the prior's mean, and how far estimates and deviations are stretched.
+        self.register_buffer("centre", torch.zeros(2, 2, len(TARGETS)))
+        self.register_buffer("shrinkage", torch.ones(2, 2, len(TARGETS)))
+        self.register_buffer("widening", torch.ones(2, 2, len(TARGETS)))
         self.register_buffer("weave_temperature", torch.ones(()))
         self.register_buffer("count_temperature", torch.ones(()))
 
-    def fit_inputs(self, texture: Tensor, lattice: Tensor, values: Tensor, known: Tensor) -> None:
+    def fit_inputs(self, texture: Tensor, detail: Tensor, lattice: Tensor, values: Tensor, known: Tensor) -> None:
         """Set what is not trained from the examples of the training part."""
         self.texture.fit(even(texture, self.components))
+        self.detail.fit(folded(detail))
         self.lattice.fit(lattice)
         # Both systems share one scale: every picture also occurs turned by a quarter.
         weight = known.float()
@@ -161,38 +168,50 @@ class Robust(nn.Module):
         self.target_mean = mean.expand(2, -1).clone()
         self.target_scale = variance.sqrt().clamp(min=1e-3).expand(2, -1).clone()
 
-    def reduced(self, texture: Tensor, lattice: Tensor) -> Tensor:
-        """What weave and numbers take, (B, components)."""
-        return torch.cat([self.texture(even(texture, self.components)), self.lattice(lattice)], dim=1)
+    def reduced(self, texture: Tensor, detail: Tensor, lattice: Tensor) -> Tensor:
+        """What the numbers take, (B, components): texture, lattice and, which the weave does not take, detail."""
+        parts = [self.texture(even(texture, self.components)), self.lattice(lattice), self.detail(folded(detail))]
+        return torch.cat(parts, dim=1)
 
     def blinded(self, x: Tensor, which: Tensor) -> Tensor:
-        """What weave and numbers take, with the texture of some rows (B,) replaced by the mean texture."""
+        """``reduced`` inputs with the texture of some rows (B,) replaced by the mean texture."""
         return torch.cat([x[:, :TEXTURE_COMPONENTS].masked_fill(which[:, None], 0.0), x[:, TEXTURE_COMPONENTS:]], dim=1)
 
     def standardised(self, values: Tensor) -> Tensor:
         """Targets (..., 2, P) less their mean, over their scale."""
         return (values - self.target_mean) / self.target_scale
 
-    def number_outputs(self, x: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-        """Means and log variances (members, B, 2, P) of standardised targets; ``counts`` (B, 2) log counts."""
+    def number_outputs(self, x: Tensor, counts: Tensor, table4: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and log variances (members, B, 2, P) of standardised targets.
+
+        ``counts`` (B, 2) log counts; ``table4`` (B,) whether the fabric is known to come from Table 4 of Li et al.
+        2024, whose fabrics are much more alike than cloth is.
+        """
         k = INDEX["count"]
         hint = (counts - self.target_mean[:, k]) / self.target_scale[:, k]
-        y = self.numbers(torch.cat([x, hint], dim=1)).unflatten(2, (2, 2, len(TARGETS)))
+        kind = 2.0 * table4.to(x)[:, None] - 1.0
+        y = self.numbers(torch.cat([x, hint, kind], dim=1)).unflatten(2, (2, 2, len(TARGETS)))
         return y[:, :, 0], MAX_LOG_VARIANCE - F.softplus(MAX_LOG_VARIANCE - y[:, :, 1]).clamp(
             max=MAX_LOG_VARIANCE - MIN_LOG_VARIANCE
         )
 
-    def number_estimates(self, x: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+    def number_estimates(self, x: Tensor, counts: Tensor, table4: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation (B, 2, P) of the targets, of all members together, calibrated."""
-        means, log_variances = self.number_outputs(x, counts)
+        means, log_variances = self.number_outputs(x, counts, table4)
         mean = means.mean(dim=0)
         variance = log_variances.exp().mean(dim=0) + means.var(dim=0, unbiased=False)
-        mean, deviation = mean * self.shrinkage, variance.sqrt() * self.widening
+        which = table4.long()
+        mean = self.centre[which] + (mean - self.centre[which]) * self.shrinkage[which]
+        deviation = variance.sqrt() * self.widening[which]
         return mean * self.target_scale + self.target_mean, deviation * self.target_scale
+
+    def weave_outputs(self, x: Tensor) -> Tensor:
+        """Logits (members, B, LABELS)."""
+        return self.weave(x[:, : TEXTURE_COMPONENTS + LATTICE_COMPONENTS])
 
     def weave_probabilities(self, x: Tensor) -> Tensor:
         """(B, LABELS), the mean of all members, calibrated."""
-        return (self.weave(x) * self.weave_temperature).softmax(dim=2).mean(dim=0)
+        return (self.weave_outputs(x) * self.weave_temperature).softmax(dim=2).mean(dim=0)
 
     def count_probabilities(self, spectra: Tensor) -> Tensor:
         """(B, 2, BINS) for warp and weft, calibrated."""

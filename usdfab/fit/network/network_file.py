@@ -16,6 +16,7 @@ from usdfab.disk import refused
 from usdfab.errors import UsdfabError
 from usdfab.fabric.weave import PAPER_WEAVES
 from usdfab.files import whole_file
+from usdfab.fit.network.detail import DETAIL_SIZE, REVISION as DETAIL_REVISION
 from usdfab.fit.network.inputs import LEVELS, REVISION, SIZE, Basis
 from usdfab.fit.network.labels import LABELS
 from usdfab.fit.network.model import Paper, Robust
@@ -23,7 +24,7 @@ from usdfab.fit.network.paper import NUMBERS
 from usdfab.fit.network.spectra import BINS, LATTICE_SHAPE
 from usdfab.fit.network.targets import targets_hash
 
-FORMAT = "usdfab-network/1"
+FORMAT = "usdfab-network/2"
 SHIPPED = Path(__file__).parent.parent / "weights" / "network_robust.safetensors"
 SHIPPED_SHA256 = "fa69f47394ba0383b089aeef924930252c6d0a309bfbc0c36af30092930dd593"
 """Of the shipped weights, checked at each load."""
@@ -63,7 +64,7 @@ def interface() -> dict[str, str]:
         "format": FORMAT,
         "targets": targets_hash(),
         "labels": json.dumps(LABELS),
-        "inputs": json.dumps([REVISION, SIZE, list(LEVELS), BINS, list(LATTICE_SHAPE)]),
+        "inputs": json.dumps([REVISION, SIZE, list(LEVELS), BINS, list(LATTICE_SHAPE), DETAIL_REVISION, DETAIL_SIZE]),
     }
 
 

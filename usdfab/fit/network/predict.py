@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.fit.features import FeatureNet, fast_dtype
-from usdfab.fit.network.inputs import feature_net, prepared, texture_vectors
+from usdfab.fit.network.detail import detail_vector, rectified
+from usdfab.fit.network.inputs import Basis, feature_net, prepared, texture_vectors
 from usdfab.fit.network.labels import LABELS, typical_weave, weave_label
 from usdfab.fit.network.model import Robust
 from usdfab.fit.network.network_file import Weights
@@ -85,7 +86,7 @@ class Guess:
         return decode(self.values)
 
 
-def predict(photo: NDArray, weights: Weights, net: FeatureNet | None = None) -> Guess:
+def predict(photo: NDArray, weights: Weights, net: FeatureNet | None = None, *, table4: bool = False) -> Guess:
     """Look at a photo.
 
     Parameters
@@ -96,6 +97,8 @@ def predict(photo: NDArray, weights: Weights, net: FeatureNet | None = None) -> 
         Of a ``robust`` network.
     net:
         The feature network, if it is at hand.
+    table4:
+        Whether the picture is a render of a fabric from Table 4 of Li et al. 2024. These differ less than cloth does.
 
     Raises
     ------
@@ -109,21 +112,22 @@ def predict(photo: NDArray, weights: Weights, net: FeatureNet | None = None) -> 
     height, width = np.asarray(photo).shape[:2]
     square = prepared(photo)
     maps = texture_maps(square)
-    pictures = np.stack([turn.picture(square) for turn in LOOKS])
-    textures = torch.from_numpy(texture_vectors(net, weights.basis, pictures))
     with torch.no_grad():
         # Turned pictures have the same spectra, with the axes exchanged.
         spectra = torch.from_numpy(axis_spectra(maps)).float()[None]
         odds = network.count_probabilities(spectra)[0].double().numpy()
         odds /= odds.sum(axis=1, keepdims=True)
-        rough = FREQUENCIES[odds.argmax(axis=1)]
+        rough = likeliest(odds)
         found = refined(maps, (float(rough[0]), float(rough[1])))
         exact = np.array([f.cycles for f in found])
-        lattice = torch.from_numpy(np.stack([_lattice(maps, found, turn) for turn in LOOKS])).float()
+        looks = [_look(net, weights.basis, square, maps, found, turn) for turn in LOOKS]
+        texture, detail, lattice = (torch.from_numpy(np.stack(part)).float() for part in zip(*looks, strict=True))
         hints = np.log(np.stack([exact if turn.quarters % 2 == 0 else exact[::-1] for turn in LOOKS]))
-        x = network.reduced(textures, lattice)
+        kind = torch.full((len(LOOKS),), table4)
+        x = network.reduced(texture, detail, lattice)
         weave = network.weave_probabilities(x).double().numpy()
-        means, deviations = (t.double().numpy() for t in network.number_estimates(x, torch.from_numpy(hints).float()))
+        found_numbers = network.number_estimates(x, torch.from_numpy(hints).float(), kind)
+        means, deviations = (t.double().numpy() for t in found_numbers)
     stretch = np.array([width, height]) / min(width, height)
     values = np.mean([values_back(m, turn) for m, turn in zip(means, LOOKS, strict=True)], axis=0)
     # The looks share their errors: averaging does not divide the variance by their number.
@@ -162,6 +166,12 @@ def estimates(guess: Guess, width: float) -> dict[str, tuple[Floats, Floats]]:
     return found
 
 
+def likeliest(odds: Floats) -> Floats:
+    """(2,) counts of ``odds`` (2, BINS): the mean over the bins about the likeliest, finer than a bin."""
+    near = np.abs(np.arange(odds.shape[1]) - odds.argmax(axis=1)[:, None]) <= 3
+    return np.asarray(np.exp((odds * near) @ np.log(FREQUENCIES) / (odds * near).sum(axis=1)))
+
+
 def turned_back(probabilities: Floats, turn: Turn) -> Floats:
     """Probabilities (L,) of the weave in a turned picture as those of the picture before."""
     return np.asarray(probabilities)[list(_labels_after(turn.quarters % 2))]
@@ -185,7 +195,12 @@ def _labels_after(quarters: int) -> tuple[int, ...]:
     return tuple(turned)
 
 
-def _lattice(maps: Floats, found: tuple[Frequency, Frequency], turn: Turn) -> Floats:
-    """The lattice spectrum of the turned picture, (LATTICE_SIZE,)."""
+def _look(
+    net: FeatureNet, basis: Basis, square: NDArray[np.float32], maps: Floats, found: tuple[Frequency, Frequency],
+    turn: Turn,
+) -> tuple[NDArray, Floats, Floats]:  # fmt: skip
+    """Texture, detail and lattice of the turned picture, each a vector."""
     warp, weft = (f.turned(turn) for f in (found if turn.quarters % 2 == 0 else found[::-1]))
-    return lattice_spectrum(turned_maps(maps, turn), warp, weft).ravel()
+    upright = rectified(np.ascontiguousarray(turn.picture(square)), warp, weft)
+    texture = texture_vectors(net, basis, upright[None])[0]
+    return texture, detail_vector(upright), lattice_spectrum(turned_maps(maps, turn), warp, weft).ravel()

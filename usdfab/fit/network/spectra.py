@@ -35,6 +35,9 @@ _TILTS = np.radians(np.linspace(-8.0, 8.0, 9))
 STEPS = 16
 """Samples of a lattice spectrum per cycle per crossing; it is computed twice as finely, and the larger kept."""
 
+HINT_TRUST = 0.04
+"""Relative deviation of the counts about which frequencies are refined."""
+
 LATTICE_SHAPE = (3, STEPS + 1, 2 * STEPS + 2)
 LATTICE_SIZE = int(np.prod(LATTICE_SHAPE))
 _SHARE = 0.92
@@ -76,17 +79,34 @@ def axis_spectra(maps: Floats) -> Floats:
 
 
 def refined(maps: Floats, counts: tuple[float, float]) -> tuple[Frequency, Frequency]:
-    """The strongest frequencies within a tenth of the ``counts`` of warp and weft in (3, N, N) maps."""
+    """The likeliest frequencies within a tenth of the ``counts`` of warp and weft in (3, N, N) maps.
+
+    Where few yarns are seen peaks are wide and lean on each other: ``counts`` are taken to be right within
+    ``HINT_TRUST``, which weighs more there.
+    """
     tilts = np.radians(np.linspace(-9.0, 9.0, 19))
     found = []
     for sign, turned, count in zip((1.0, -1.0), _both_ways(maps), counts, strict=True):
-        cycles = count * np.linspace(0.9, 1.1, 21)
+        shares = np.linspace(0.9, 1.1, 21)
+        cycles = count * shares
         power = _wedge(turned, cycles, tilts)
         total = (power / (power.mean(axis=(1, 2), keepdims=True) + 1e-12)).sum(axis=0)
+        total *= np.exp(-0.5 * (np.log(shares) / HINT_TRUST) ** 2)[:, None]
         row, column = np.unravel_index(int(total.argmax()), total.shape)
         # Rows run down, so along x a positive slope of the frequency is clockwise.
         found.append(Frequency(_vertex(cycles, total[:, column], int(row)), -sign * float(tilts[column])))
     return found[0], found[1]
+
+
+def to_lattice(size: int, warp: Frequency, weft: Frequency) -> Floats:
+    """(2, 2) that maps crossings (u to the right, v upwards) to pixels (x to the right, y upwards) in a picture.
+
+    ``size``: pixels on a side of the picture that the frequencies belong to.
+    """
+    # Rows of the matrix: directions of both frequencies, x to the right and y up, in yarns per pixel.
+    a = warp.cycles / size * np.array([1.0, np.tan(warp.tilt)])
+    b = weft.cycles / size * np.array([-np.tan(weft.tilt), 1.0])
+    return np.asarray(np.linalg.inv(np.stack([a, b])))
 
 
 def lattice_spectrum(maps: Floats, warp: Frequency, weft: Frequency) -> Floats:
@@ -95,10 +115,7 @@ def lattice_spectrum(maps: Floats, warp: Frequency, weft: Frequency) -> Floats:
     u counts warp yarns to the right, v weft yarns upwards.
     """
     size = maps.shape[-1]
-    # Rows of the matrix: directions of both frequencies, x to the right and y up, in yarns per pixel.
-    a = warp.cycles / size * np.array([1.0, np.tan(warp.tilt)])
-    b = weft.cycles / size * np.array([-np.tan(weft.tilt), 1.0])
-    back = np.linalg.inv(np.stack([a, b]))
+    back = to_lattice(size, warp, weft)
     yarns = np.array([warp.cycles, weft.cycles]) * _SHARE
     places = (np.arange(_RECTIFIED) + 0.5) / _RECTIFIED - 0.5
     u, v = np.meshgrid(places * yarns[0], places * yarns[1])

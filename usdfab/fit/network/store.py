@@ -22,11 +22,13 @@ from torch import Tensor
 
 from usdfab.disk import refused
 from usdfab.errors import UsdfabError
+from usdfab.fabric import FabricParameters
 from usdfab.files import whole_file
 from usdfab.fit.dataset.reader import Stored, read_dataset
 from usdfab.fit.dataset.settings import Settings, settings_of
 from usdfab.fit.dataset.store import MANIFEST, read_manifest
 from usdfab.fit.features import FeatureNet
+from usdfab.fit.network.detail import DETAIL_SIZE, REVISION as DETAIL_REVISION, detail_vector, rectified
 from usdfab.fit.network.drawn import REVISION as DRAWN_REVISION, drawn_cloth
 from usdfab.fit.network.inputs import LEVELS, REVISION as INPUT_REVISION, Basis, fitted_basis, prepared, texture_vectors
 from usdfab.fit.network.labels import LABELS, weave_label
@@ -35,7 +37,7 @@ from usdfab.fit.network.splits import split_of
 from usdfab.fit.network.targets import encode, targets_hash
 from usdfab.fit.network.views import REVISION as VIEW_REVISION, as_photographed, view
 
-FORMAT = "usdfab-network-inputs/1"
+FORMAT = "usdfab-network-inputs/2"
 BASIS = "basis.safetensors"
 BASIS_PICTURES = 48
 """Pictures of the training part from which the channels' components come."""
@@ -58,8 +60,12 @@ class Rows:
         Sample and view.
     table4: (R,) bool
         Whether the fabric comes from Table 4 of Li et al. 2024; else from the wide prior.
-    texture: (R, D), spectra: (R, 2, 3, BINS), lattice: (R, LATTICE_SIZE) float32
-        See ``inputs.texture_vectors``, ``spectra.axis_spectra`` and ``spectra.lattice_spectrum``.
+    texture: (R, D), detail: (R, DETAIL_SIZE) float32
+        Of the rectified picture, see ``inputs.texture_vectors`` and ``detail.detail_vector``.
+    spectra: (R, 2, 3, BINS), lattice: (R, LATTICE_SIZE) float32
+        See ``spectra.axis_spectra`` and ``spectra.lattice_spectrum``.
+    whole: (R, D) float32
+        The texture vector of the picture as it is, for the paper's network; 0 for what that does not look at.
     values: (R, 2, P) float32, known: (R, 2, P) bool
         See ``targets.encode``.
     label: (R,) int64
@@ -70,6 +76,8 @@ class Rows:
     number: Tensor
     table4: Tensor
     texture: Tensor
+    detail: Tensor
+    whole: Tensor
     spectra: Tensor
     lattice: Tensor
     values: Tensor
@@ -161,10 +169,15 @@ def _kept_basis(path: Path, net: FeatureNet, stored: list[Stored]) -> Basis:
         tensors, _ = _read(path, {"format": FORMAT, "kind": "basis"})
         return Basis.from_tensors({name: torch.from_numpy(value) for name, value in tensors.items()})
     chosen = [s for s in stored if split_of(s.index) == "train"][:BASIS_PICTURES] or stored[:BASIS_PICTURES]
-    basis = fitted_basis(net, [prepared(s.image) for s in chosen])
+    basis = fitted_basis(net, [_upright(prepared(s.image), s.sample.fabric) for s in chosen])
     about = {"format": FORMAT, "kind": "basis", "pictures": str(len(chosen))}
     _write(path, {name: tensor.numpy() for name, tensor in basis.tensors().items()}, about)
     return basis
+
+
+def _upright(picture: NDArray[np.float32], fabric: FabricParameters) -> NDArray[np.float32]:
+    """The rectified picture of a fabric whose counts are known."""
+    return rectified(picture, *refined(texture_maps(picture), (fabric.warp.count, fabric.weft.count)))
 
 
 def _sample(stored: Stored, folder: Path, net: FeatureNet, basis: Basis, views: int) -> dict[str, NDArray]:
@@ -172,7 +185,8 @@ def _sample(stored: Stored, folder: Path, net: FeatureNet, basis: Basis, views: 
     path = folder / f"{stored.index:06d}.safetensors"
     about = {
         "format": FORMAT, "kind": "sample", "image": stored.record["image_sha256"], "basis": basis.checksum(),
-        "targets": targets_hash(), "views": str(VIEW_REVISION), "labels": json.dumps(LABELS),
+        "targets": targets_hash(), "labels": json.dumps(LABELS),
+        "revision": json.dumps([VIEW_REVISION, INPUT_REVISION, DETAIL_REVISION]),
     }  # fmt: skip
     found: dict[str, NDArray] = {}
     if path.exists():
@@ -182,19 +196,23 @@ def _sample(stored: Stored, folder: Path, net: FeatureNet, basis: Basis, views: 
     sample, image = stored.sample, stored.image
     numbers = range(len(found["number"]) if found else 0, views)
     shown = [view(image, sample.fabric, stored.index, number) for number in numbers]
-    textures = texture_vectors(net, basis, np.stack([picture for picture, _ in shown]))
     new = []
-    for number, (picture, fabric), texture in zip(numbers, shown, textures, strict=True):
+    for number, (picture, fabric) in zip(numbers, shown, strict=True):
         maps = texture_maps(picture)
         values, known = encode(fabric)
         rng = np.random.default_rng([stored.index, number, 1])
         warp, weft = (float(c * np.exp(rng.normal(0.0, HINT_SIGMA))) for c in (fabric.warp.count, fabric.weft.count))
+        found_at = refined(maps, (warp, weft))
+        upright = rectified(picture, *found_at)
+        texture = texture_vectors(net, basis, upright[None])[0]
+        table4 = sample.prior == "paper"
+        whole = texture_vectors(net, basis, picture[None])[0] if table4 and number == 0 else np.zeros_like(texture)
         new.append(
             {
-                "index": np.int64(stored.index), "number": np.int64(number),
-                "table4": np.bool_(sample.prior == "paper"), "texture": texture.astype(np.float16),
-                "spectra": axis_spectra(maps).astype(np.float16),
-                "lattice": lattice_spectrum(maps, *refined(maps, (warp, weft))).ravel().astype(np.float16),
+                "index": np.int64(stored.index), "number": np.int64(number), "table4": np.bool_(table4),
+                "texture": texture.astype(np.float16), "whole": whole.astype(np.float16),
+                "detail": detail_vector(upright).astype(np.float16), "spectra": axis_spectra(maps).astype(np.float16),
+                "lattice": lattice_spectrum(maps, *found_at).ravel().astype(np.float16),
                 "values": values.astype(np.float32), "known": known,
                 "label": np.int64(LABELS.index(weave_label(fabric.weave))),
             }
@@ -212,9 +230,9 @@ def _rows(parts: list[dict[str, NDArray]]) -> Rows:
         return tensor.float() if tensor.is_floating_point() else tensor
 
     rows = Rows(**{name: joined(name) for name in Rows.__dataclass_fields__})
-    if rows.lattice.shape[1] != LATTICE_SIZE or not all(
-        getattr(rows, name).isfinite().all() for name in ("texture", "spectra", "lattice", "values")
-    ):
+    sized = (rows.lattice.shape[1], rows.detail.shape[1]) == (LATTICE_SIZE, DETAIL_SIZE)
+    checked = ("texture", "detail", "whole", "spectra", "lattice", "values")
+    if not sized or not all(getattr(rows, name).isfinite().all() for name in checked):
         raise UsdfabError("the inputs hold numbers that are not finite, or too few", remedy="remove their folder")
     return rows
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from usdfab.errors import UsdfabError
 from usdfab.fabric.weave import PAPER_WEAVES
 from usdfab.fit.network.checkpoint import State, identity_of, load_checkpoint, save_checkpoint
-from usdfab.fit.network.model import TEXTURE_COMPONENTS, Paper, Robust, bin_targets
+from usdfab.fit.network.model import DETAIL_COMPONENTS, TEXTURE_COMPONENTS, Paper, Robust, bin_targets
 from usdfab.fit.network.paper import NUMBERS, shares
 from usdfab.fit.network.spectra import BIN_WIDTH, HIGH, LOW
 from usdfab.fit.network.store import Drawn, Prepared, Rows, component_counts
@@ -175,10 +175,10 @@ def new_network(model: str, data: Prepared, rows: Rows) -> Robust | Paper:
     components = component_counts(data.basis)
     if model == "paper":
         paper = Paper(components, len(PAPER_WEAVES), 2 * len(NUMBERS))
-        paper.fit_inputs(rows.texture)
+        paper.fit_inputs(rows.whole)
         return paper
     robust = Robust(components, rows.texture.shape[1])
-    robust.fit_inputs(rows.texture, rows.lattice, rows.values, rows.known)
+    robust.fit_inputs(rows.texture, rows.detail, rows.lattice, rows.values, rows.known)
     return robust
 
 
@@ -189,14 +189,14 @@ def _examples(network: Robust | Paper, rows: Rows, where: torch.device) -> Examp
     """What an epoch needs, computed once and brought to the device."""
     found: Examples = {"label": rows.label}
     if isinstance(network, Paper):
-        found |= {"texture": rows.texture, "shares": shares(rows.values)}
+        found |= {"texture": rows.whole, "shares": shares(rows.values)}
     else:
         with torch.no_grad():
             x = torch.cat(
-                [network.reduced(t.to(where), s.to(where)) for t, s in
-                 zip(rows.texture.split(1024), rows.lattice.split(1024), strict=True)]
+                [network.reduced(*(part.to(where) for part in parts)) for parts in
+                 zip(rows.texture.split(1024), rows.detail.split(1024), rows.lattice.split(1024), strict=True)]
             )  # fmt: skip
-        found |= {"x": x, "spectra": rows.spectra, "values": rows.values, "known": rows.known}
+        found |= {"x": x, **{name: getattr(rows, name) for name in ("spectra", "values", "known", "table4")}}
     return {name: tensor.to(where) for name, tensor in found.items()}
 
 
@@ -205,8 +205,8 @@ def _drawn_examples(network: Robust | Paper, drawn: Drawn | None, where: torch.d
         return None
     with torch.no_grad():
         lattice = network.lattice(drawn.lattice.to(where))
-        # The mean texture is 0 here.
-        x = F.pad(lattice, (TEXTURE_COMPONENTS, 0))
+        # The mean texture and the mean detail are 0 here.
+        x = F.pad(lattice, (TEXTURE_COMPONENTS, DETAIL_COMPONENTS))
     return {"x": x, **{name: getattr(drawn, name).to(where) for name in ("spectra", "counts", "label")}}
 
 
@@ -266,7 +266,7 @@ def _losses(network: Robust | Paper, batch: Examples, *, training: bool) -> dict
     if training:
         hint = counts + HINT_NOISE * torch.randn_like(counts)
         x = x + INPUT_NOISE * torch.randn_like(x)
-    means, log_variances = network.number_outputs(x, hint)
+    means, log_variances = network.number_outputs(x, hint, batch["table4"])
     wanted = network.standardised(batch["values"])
     nll = 0.5 * (log_variances + (means - wanted).square() * (-log_variances).exp())
     if training:
@@ -284,7 +284,7 @@ def _lattice_losses(network: Robust, batch: Examples, *, training: bool) -> dict
         x = network.blinded(x, torch.rand(len(x), device=x.device) < BLIND)
         x = x + INPUT_NOISE * torch.randn_like(x)
     logits = network.counts(spectra)
-    weave = network.weave(x)
+    weave = network.weave_outputs(x)
     labels = batch["label"].expand(len(weave), -1).flatten()
     smoothing = LABEL_SMOOTHING if training else 0.0
     return {

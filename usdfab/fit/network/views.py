@@ -14,7 +14,7 @@ from usdfab.fit.network.turns import TURNS, cropped, recolored
 from usdfab.fit.network.unevenness import sample_unevenness, uneven
 from usdfab.srgb import srgb_to_linear
 
-REVISION = 1
+REVISION = 3
 """Raised whenever the same sample and number give another view."""
 
 CROP_SHARE = 0.5
@@ -30,7 +30,8 @@ def view(
 ) -> tuple[NDArray[np.float32], FabricParameters]:
     """View ``number`` of a sample: a prepared picture, and the fabric that it shows.
 
-    Number 0 is the render as it is; all others are random, the same each time.
+    Number 0 is the render as it is; all others are random, the same each time: odd ones as a camera shows them, even
+    ones as rendered.
     """
     if number == 0:
         return prepared(pixels), fabric
@@ -42,8 +43,8 @@ def view(
         least = LEAST_YARNS / min(fabric.warp.count, fabric.weft.count)
         share = rng.uniform(min(1.0, max(SMALLEST_CROP, least)), 1.0)
         pixels, fabric = cropped(pixels, fabric, share, (float(rng.random()), float(rng.random())))
-    shown = turn.picture(as_photographed(pixels, fabric, rng))
-    return prepared(shown), turn.fabric(fabric)
+    shown = as_photographed(pixels, fabric, rng) if number % 2 else pixels
+    return prepared(turn.picture(shown)), turn.fabric(fabric)
 
 
 def as_photographed(
