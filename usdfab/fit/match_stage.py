@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-FORMAT = "usdfab-match/2"
+FORMAT = "usdfab-match/3"
 LONGEST_STEP = 2.0
 DAMPINGS = (0.01, 0.1, 1.0, 10.0)
 """Tried one after another until a step leads down; each iteration begins with the one that last did."""
@@ -102,7 +102,7 @@ class MatchSettings:
 
 
 DRAFTED = (
-    "radius", "flattening", "crimp", "twist", "unevenness", "waviness", "fiber_count", "flyaway_density",
+    "radius", "flattening", "crimp", "twist", "waviness", "irregularity", "flyaway_density", "albedo_variation",
     "roughness_azimuthal", "albedo", EXPOSURE,
 )  # fmt: skip
 """What a draft moves: what one round can settle, and is seen at its resolution."""
