@@ -15,15 +15,17 @@ from typing import Any
 from usdfab.fabric import SYSTEMS, FabricParameters, YarnParameters
 from usdfab.usd.rig import Rig, rig_for, ring_rig
 
-RING_ELEVATIONS = (0.9, 0.6)
+RING_ELEVATIONS = (0.6,)
 """Radians above the cloth: ring lamps of microscopes."""
 
 SIDE_ELEVATION = 0.7
-SIDE_AZIMUTHS = tuple(0.25 * math.pi * k for k in range(8))
-"""One lamp from the side: across either yarn system, whose yarns then have a bright and a dark side, or between."""
+SIDE_AZIMUTHS = tuple(0.5 * math.pi * k for k in range(4))
+"""One lamp from the side, across either yarn system, whose yarns then have a bright and a dark side."""
 
 OTHER_ELEVATIONS = (0.45, 0.95)
-"""Of the lamps found best, in a second look."""
+"""Of the lamps found best, in a second look; they are turned, too."""
+
+TURNS = (0.25 * math.pi, -0.25 * math.pi)
 
 FULL: Mapping[str, float] = {
     "irregularity": 0.1, "crimp": 0.9, "inclination": 1.0, "unevenness": 0.1, "waviness": 0.12,
@@ -33,7 +35,7 @@ FULL: Mapping[str, float] = {
 
 FULL_FLATTENING = 1.1
 
-FIBERS = 80
+FIBERS = 70
 """Fibers of a yarn as they show: real ones are thinner and many, but lie in strands."""
 
 SURFACE_ANGLES = (0.25, -0.25, 0.5, -0.5)
@@ -72,12 +74,14 @@ def questions(shapes: bool, rig_known: bool) -> tuple[tuple[Look, ...], ...]:
     """
     if not shapes:
         return ()
-    lamps = () if rig_known else tuple(_lamps())
+    lamps: tuple[Look, ...] = (_as_lit, *(() if rig_known else _lamps()))
+    moved: tuple[Look, ...] = (*map(_elevated, OTHER_ELEVATIONS), *map(_turned, TURNS))
     return (
-        # A lamp from the side suits only yarns that have sides, so both are asked for at once.
-        (_full, *(_then(_full, lamp) for lamp in lamps), *lamps[: len(RING_ELEVATIONS)]),
-        (*(_width(w) for w in WIDTHS), _closed),
-        () if rig_known else tuple(map(_elevated, OTHER_ELEVATIONS)),
+        # A lamp from the side suits only yarns that have sides, and closed cloth only lamps that show its valleys. So
+        # these are asked for at once.
+        tuple(_then(shape, lamp) for shape in (_full, _then(_full, _closed)) for lamp in lamps),
+        tuple(_width(w) for w in WIDTHS),
+        () if rig_known else moved,
         tuple(map(_spun, SURFACE_ANGLES)),
         (_plied,),
         (_yarns(albedo_variation=0.7),),
@@ -92,6 +96,10 @@ def looks_at(start: Seen, asked: tuple[tuple[Look, ...], ...], answers: tuple[in
         if answer >= 0:
             start = question[answer](start)
     return start
+
+
+def _as_lit(seen: Seen) -> Seen:
+    return seen
 
 
 def _lamps() -> list[Look]:
@@ -110,6 +118,16 @@ def _elevated(elevation: float) -> Look:
     def look(seen: Seen) -> Seen:
         rig = seen.rig or rig_for(seen.fabric.size)
         return Seen(seen.fabric, ring_rig(seen.fabric.size, elevation, rig.lamps, rig.azimuth))
+
+    return look
+
+
+def _turned(angle: float) -> Look:
+    """The same lamp from another side."""
+
+    def look(seen: Seen) -> Seen:
+        rig = seen.rig or rig_for(seen.fabric.size)
+        return Seen(seen.fabric, replace(rig, azimuth=rig.azimuth + angle) if rig.lamps == 1 else seen.rig)
 
     return look
 
@@ -137,7 +155,7 @@ def _full(seen: Seen) -> Seen:
     def change(yarn: YarnParameters, _: float) -> dict[str, Any]:
         flattening = min(yarn.flattening, FULL_FLATTENING)
         shape = {"flattening": flattening, "radius": yarn.radius * yarn.flattening / flattening}
-        return dict(FULL) | shape | {"fiber_count": min(yarn.fiber_count, FIBERS)}
+        return dict(FULL) | shape | {"fiber_count": FIBERS}
 
     return _each(change)(seen)
 

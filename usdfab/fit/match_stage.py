@@ -43,8 +43,9 @@ LONGEST_STEP = 2.0
 DAMPINGS = (0.01, 0.1, 1.0, 10.0)
 """Tried one after another until a step leads down; each iteration begins with the one that last did."""
 
-LIGHTS = (0.75, 1.0, 1.33, 1.75)
-"""Exposures, times the best so far, in which each first look is taken."""
+LIGHTS = (0.75, 1.0, 1.33)
+"""Exposures in which each first look is taken, times that which makes it as bright as the photo on the mean: what suited
+the looks before does not suit other lamps."""
 
 VARIED_CELLS = 16
 """Crossings of all variants of the repeat together beyond which pictures show fewer variants."""
@@ -304,6 +305,7 @@ class _Search:
         self._each = len(self.space.names) + settings.steps * len(DAMPINGS)
         self._done = self.state.round * self._each
         self.loss = math.inf
+        self._seen: list[Seen] = []
 
     def begin(self) -> None:
         """Take the first looks, or go back to the point where the search stood."""
@@ -313,29 +315,32 @@ class _Search:
             self._done += sum(map(len, self.questions))
             self.picture, self.residuals, self.loss = self._look(state.point)
             return
-        self._try((), exposure, lights=(1.0,))
+        self._try((), exposure)
         state.losses.append(self.loss)
         for question in self.questions:
             before, kept = self.loss, state.answers
             state.answers = (*kept, -1)
             for answer in range(len(question)):
-                self._try((*kept, answer), exposure, lights=LIGHTS)
+                self._try((*kept, answer), exposure)
             if self.loss < before:
                 state.losses.append(self.loss)
         self._settle(exposure)
 
-    def _try(self, answers: tuple[int, ...], exposure: float, lights: tuple[float, ...]) -> None:
-        """Look at some answers in several lights, about that which suited the best answers so far."""
+    def _try(self, answers: tuple[int, ...], exposure: float) -> None:
+        """Look at some answers in several lights; the start also in its own."""
         seen = looks_at(self.start, self.questions, answers)
-        picture = self.pictures.picture(seen.fabric, seen.rig)
         self._done += 1
-        light_before = self.state.light
-        for light in lights:
-            residuals = self.pictures.residuals(picture, exposure * light_before * light)
+        if answers and seen in self._seen:
+            return
+        self._seen.append(seen)
+        picture = self.pictures.picture(seen.fabric, seen.rig)
+        mean = float(self.pictures.mean.mean()) / max(exposure * float(picture.mean()), 1e-6)
+        for light in (*(mean * factor for factor in LIGHTS), *(() if answers else (1.0,))):
+            residuals = self.pictures.residuals(picture, exposure * light)
             loss = soft_l1(residuals, self.pictures.weights)
             if loss < self.loss:
                 self.picture, self.residuals, self.loss = picture, residuals, loss
-                self.state.answers, self.state.light = answers, light_before * light
+                self.state.answers, self.state.light = answers, light
         self._tell(self.loss)
 
     def _settle(self, exposure: float) -> None:
