@@ -60,6 +60,7 @@ class YarnParameters:
     flyaway_spread: float = _default("flyaway_spread")
     albedo: Color = _default("albedo")
     yarn_albedo: tuple[Color, ...] = _default("yarn_albedo")
+    albedo_variation: float = _default("albedo_variation")
     roughness_longitudinal: float = _default("roughness_longitudinal")
     roughness_azimuthal: float = _default("roughness_azimuthal")
     roughness_primary: float = _default("roughness_primary")

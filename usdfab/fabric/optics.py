@@ -69,7 +69,20 @@ class Optics:
 
 
 def optics_of(fabric: FabricParameters) -> Optics:
-    """The optical parameters of a fabric."""
+    """The optical parameters of a fabric.
+
+    Raises
+    ------
+    UsdfabError
+        For fibers that differ in albedo within a yarn: these numbers do not describe them.
+    """
+    for system in SYSTEMS:
+        if fabric.system(system).albedo_variation > 0.0:
+            raise UsdfabError(
+                "gradients, the raster and path stages and flattened fibers know one albedo for all fibers of a yarn",
+                place=f"{system}.albedo_variation",
+                remedy=f"set {system}.albedo_variation to 0",
+            )
     colors = [list(dict.fromkeys(fabric.system(s).colors())) for s in SYSTEMS]
     yarns = [fabric.system(s) for s in SYSTEMS]
     return Optics(

@@ -195,6 +195,15 @@ YARN_PARAMETERS: tuple[Parameter, ...] = (
         group="Appearance",
     ),
     Parameter(
+        "albedo_variation", "sigma_C", "1", "float", 0.0, (0.0, 3.0), (0.0, 1.0),
+        "How much fibers of a yarn differ in albedo: C^exp(albedo_variation z), z of standard deviation 1, so that the "
+        "root of a fiber's absorption (eq. 3) is log-normal. Dyed yarns have about 0.1 to 0.3, melange yarns 0.5 and "
+        "more.",
+        ("match",),
+        group="Appearance",
+        since=4,
+    ),
+    Parameter(
         "roughness_longitudinal", "gamma_M", "1", "float", 0.5, (0.01, 1.0), (0.1, 0.9),
         "Longitudinal roughness of the lobes that pass through the fiber (TT, TRT, rest).",
         ("network", "raster", "path"),

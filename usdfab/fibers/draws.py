@@ -12,11 +12,12 @@ from usdfab.fabric import SYSTEMS, ply_circles
 from usdfab.fibers.cross_section import JITTER, fiber_radius
 from usdfab.fibers.randomness import hash_integers, normal, uniform
 from usdfab.fibers.segments import Layout
+from usdfab.fibers.shades import drawn_shades
 from usdfab.fibers.unevenness import highest
 
 Floats = NDArray[np.float64]
 
-_PHASE, _VARIANT, _ROTATION, _THICKNESS, _WANDER = 6, 7, 8, 10, 11
+_PHASE, _VARIANT, _ROTATION, _THICKNESS, _WANDER, _SHADE = 6, 7, 8, 10, 11, 12
 """Channels of draws that Li et al. 2024 do not have (9 is that of flyaways)."""
 
 
@@ -28,7 +29,8 @@ class Draws:
     Of ``plies`` plies, fiber i belongs to ply ``i % plies``, in which it is number ``i // plies``; all plies hold
     equally many. ``phase`` (yarns,) radians is where ply 0 starts; fibers of a ply share their ``kappa``.
     ``thickness`` and ``wander`` (yarns, cells along) are standard normal: what a yarn's unevenness and its sideways
-    wandering are interpolated from, see ``unevenness.interpolated``.
+    wandering are interpolated from, see ``unevenness.interpolated``. ``shade`` (yarns, fibers) numbers
+    ``shades.LEVELS``, None where all fibers of a yarn have one albedo.
     """
 
     jitter: Floats
@@ -40,6 +42,7 @@ class Draws:
     phase: Floats = field(default_factory=lambda: np.zeros(1))
     thickness: Floats = field(default_factory=lambda: np.zeros((1, 1)))
     wander: Floats = field(default_factory=lambda: np.zeros((1, 1)))
+    shade: NDArray[np.int64] | None = None
 
     @property
     def fibers(self) -> int:
@@ -47,10 +50,10 @@ class Draws:
         return self.jitter.shape[1]
 
 
-def draw(layout: Layout, fiber_count: int, seed: int, plies: int = 1) -> Draws:
+def draw(layout: Layout, fiber_count: int, seed: int, plies: int = 1, shaded: bool = False) -> Draws:
     """All draws, as hashes of (seed, system, yarn, fiber, segment, channel).
 
-    ``fiber_count`` is rounded up to a multiple of ``plies``.
+    ``fiber_count`` is rounded up to a multiple of ``plies``. ``shaded`` fibers differ in albedo (``shades.py``).
     """
     system = SYSTEMS.index(layout.system)
     fiber_count = plies * -(-fiber_count // plies)
@@ -72,6 +75,7 @@ def draw(layout: Layout, fiber_count: int, seed: int, plies: int = 1) -> Draws:
         phase=phase,
         thickness=normal(seed, system, yarn, knot, _THICKNESS),
         wander=normal(seed, system, yarn, knot, _WANDER),
+        shade=drawn_shades(uniform(*key, _SHADE), plies) if shaded else None,
     )
 
 

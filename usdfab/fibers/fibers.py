@@ -37,6 +37,10 @@ from usdfab.fibers.unevenness import THINNEST, interpolated
 SEGMENT_INDEX_PER_CELL = 8.0
 """lambda_seg of eq. 9 counts this many per cell: at Q = 0.15 the vertical noise has about one bump per cell."""
 
+OTHER_SHADE = 100.0
+"""Squared yarn radii: more than lie between any two fibers. There are equally many of each shade, so none is joined to
+another."""
+
 KAPPA_MIN = 0.25
 """kappa = 1 + U(-k, k) is not let below this; for Q > 0.3 the paper's k would turn y^kappa around."""
 
@@ -103,6 +107,8 @@ def successors(shape: YarnShape, layout: Layout, draws: Draws) -> NDArray[np.int
     for ply in range(plies):
         ends, starts = slice(ply, None, plies), slice((ply + step) % plies, None, plies)
         cost = (x1[:, ends, None] - x0[:, None, starts]) ** 2 + (z1[:, ends, None] - z0[:, None, starts]) ** 2
+        if draws.shade is not None:
+            cost = cost + OTHER_SHADE * (draws.shade[:, ends, None] != draws.shade[:, None, starts])
         successor[:, ends] = index[starts][np.stack([scipy.optimize.linear_sum_assignment(c)[1] for c in cost])]
     return successor
 

@@ -19,6 +19,7 @@ from usdfab.fibers.draws import Draws, draw, variation
 from usdfab.fibers.fibers import YarnShape, fiber_offsets, successors
 from usdfab.fibers.flyaways import OpenCurves, flyaway_counts, flyaway_offsets
 from usdfab.fibers.segments import Layout, lay_out
+from usdfab.fibers.shades import shaded_albedo
 
 RASTERIZATION_VERTICES = 10
 """Vertices per segment for rasterization (Li et al. 2024, section 7.2)."""
@@ -218,8 +219,8 @@ class YarnSystem:
         along = np.broadcast_to(layout.position * self.along_cell, across.shape)
         points = self._placed(along, across, height, layout.yarn)
         period = np.array([self.size[0], 0.0, 0.0]) if self.name == "weft" else np.array([0.0, self.size[1], 0.0])
-        colors = np.asarray(self.yarn.colors())
-        return _by_curve(layout, points, self.successor, self.radius, colors, period)
+        system = _by_curve(layout, points, self.successor, self.radius, period)
+        return replace(system, albedo=self._albedo(system.yarn, system.fiber))
 
     def flyaways(self, variant: int) -> OpenCurves | None:
         """The flyaways of a variant, or None where there are none. Those that leave the patch are variant 0's."""
@@ -244,9 +245,15 @@ class YarnSystem:
         )
         points = self._placed(along, across, height, owner[:, None])
         offsets = self.vertices * np.arange(len(owner) + 1)
-        colors = np.asarray(self.yarn.colors())
-        albedo = colors[owner % len(colors)]
+        albedo = self._albedo(owner, number % self.draws.fibers)
         return OpenCurves(self.name, points.reshape(-1, 3), offsets, owner, number, loop, self.radius, albedo)
+
+    def _albedo(self, yarn: NDArray[np.int64], fiber: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(N, 3) of fibers (N,) of yarns (N,)."""
+        colors = np.asarray(self.yarn.colors())
+        albedo = colors[yarn % len(colors)]
+        shade = self.draws.shade
+        return albedo if shade is None else shaded_albedo(albedo, self.yarn.albedo_variation, shade[yarn, fiber])
 
     def _is_inside(self, curves: OpenCurves) -> NDArray[np.bool_]:
         """Which curves do not come near the patch's border."""
@@ -285,7 +292,7 @@ def yarn_systems(
     def system(name: System) -> YarnSystem:
         yarn = fabric.system(name)
         layout = lay_out(weave, name, vertices_per_segment)
-        draws = draw(layout, yarn.fiber_count, fabric.seed, yarn.ply_count)
+        draws = draw(layout, yarn.fiber_count, fabric.seed, yarn.ply_count, yarn.albedo_variation > 0.0)
         successor = successors(YarnShape.of(yarn), layout, draws)
         cells = (dx, dy) if name == "weft" else (dy, dx)
         vertices = max(MIN_FLYAWAY_VERTICES, round(FLYAWAY_VERTICES * vertices_per_segment))
@@ -308,7 +315,6 @@ def _by_curve(
     points: NDArray[np.float64],
     successor: NDArray[np.int64],
     radius: float,
-    colors: NDArray[np.float64],
     period: NDArray[np.float64],
 ) -> FiberSystem:
     """From (fibers, stations, 3) to one curve after the other, yarn by yarn."""
@@ -324,6 +330,6 @@ def _by_curve(
         fiber=np.tile(np.arange(fibers), layout.yarns),
         successor=(successor + fibers * np.arange(layout.yarns)[:, None]).ravel(),
         radius=radius,
-        albedo=colors[yarn % len(colors)],
+        albedo=np.ones((len(yarn), 3)),
         period=period,
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from numpy.typing import NDArray
 
-from usdfab.fabric import FabricParameters
+from usdfab.fabric import SYSTEMS, FabricParameters
 from usdfab.fit.analysis import PhotoAnalysis
 from usdfab.fit.course import Course
 from usdfab.fit.fit_checkpoint import STATE_SUFFIXES, CheckpointFiles, FitCheckpoint
@@ -191,6 +191,9 @@ class LaterStages:
                 rig_known=self.rig is not None, distance=last.distance,
                 checkpoint=self.files.of(name) if self.files else None, progress=course.stage(name),
             )  # fmt: skip
+        if any(last.fabric.system(system).albedo_variation > 0.0 for system in SYSTEMS):
+            note = "the path stage was left out: it knows one albedo for all fibers of a yarn, and these differ"
+            return last.distance, replace(last, name=name, seconds=0.0, losses=(), notes=(note,), halfway=None)
         from usdfab.fit.path_run import run_path
 
         return run_path(

@@ -1,35 +1,57 @@
 """First looks of the match stage: what differs from the start in kind rather than by a little.
 
-Derivatives lead from a fabric to its neighbours. That the lamp was a ring, that yarns are spun hard the other way or
-plied, or that they do not touch, is no neighbour: the way there leads uphill. So these are simply looked at, one
-question after the other, each with the answers to those before, and what comes closer to the photo is kept.
+Derivatives lead from a fabric to its neighbours. That the lamp stood aside, that yarns are round and touch where dark
+valleys look like gaps, that they are spun hard the other way or plied, is no neighbour: the way there leads uphill. So
+these are simply looked at, one question after the other, each with the answers to those before, and what comes closer
+to the photo is kept.
+
+Round, closed, bulging yarns under a lamp across them are what brought dark satin from 0.50 to 0.30 in distance: flat
+ones under a lamp near the camera have no shading, and only gaps could make the dark lines of the photo.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 from usdfab.fabric import SYSTEMS, FabricParameters, YarnParameters
-from usdfab.usd.rig import Rig, ring_rig
+from usdfab.usd.rig import Rig, rig_for, ring_rig
 
-RING_ELEVATIONS = (0.9, 0.6)
+RING_ELEVATIONS = (0.6,)
 """Radians above the cloth: ring lamps of microscopes."""
 
 SIDE_ELEVATION = 0.7
-SIDE_AZIMUTHS = (0.8, 2.4, 4.0, 5.5)
-"""One lamp from the side, towards each corner of the picture."""
+SIDE_AZIMUTHS = tuple(0.5 * math.pi * k for k in range(4))
+"""One lamp from the side, across either yarn system, whose yarns then have a bright and a dark side."""
 
-SPUN_ANGLE = 0.45
-"""Radians between fibers and yarn on the surface of spun yarn: 15 to 35 degrees in real cloth."""
+OTHER_ELEVATIONS = (0.45, 0.95)
+"""Of the lamps found best, in a second look; they are turned, too."""
 
-SPUN_FIBERS = 60
-"""Fibers of a spun yarn as they show: real ones are thinner and many, but lie in strands."""
+TURNS = (0.25 * math.pi, -0.25 * math.pi)
 
-WIDTHS = (0.85, 0.72, 1.13)
+FULL: Mapping[str, float] = {
+    "irregularity": 0.1, "crimp": 0.9, "inclination": 1.0, "unevenness": 0.1, "waviness": 0.12,
+    "albedo_variation": 0.3,
+}  # fmt: skip
+"""Yarns that bulge over each other, of fibers that lie in order but differ in colour."""
+
+FULL_FLATTENING = 1.1
+
+FIBERS = 70
+"""Fibers of a yarn as they show: real ones are thinner and many, but lie in strands."""
+
+SURFACE_ANGLES = (0.25, -0.25, 0.5, -0.5)
+"""Radians between fibers and yarn on the surface: 15 to 35 degrees in real spun yarn."""
+
+WIDTHS = (0.85, 1.15)
 """Of the yarns, times the start's: how dark the valleys between yarns are decides much."""
+
+CLOSED_COVER = 1.04
+"""Width over spacing of yarns that leave no gap. What looks like a gap may be a valley."""
+
+MOST_TWIST = 0.6
 
 
 @dataclass(frozen=True)
@@ -56,12 +78,18 @@ def questions(shapes: bool, rig_known: bool) -> tuple[tuple[Look, ...], ...]:
     """
     if not shapes:
         return ()
+    lamps: tuple[Look, ...] = (_as_lit, *(() if rig_known else _lamps()))
+    moved: tuple[Look, ...] = (*map(_elevated, OTHER_ELEVATIONS), *map(_turned, TURNS))
     return (
-        *(() if rig_known else (tuple(_lamps()),)),
+        # A lamp from the side suits only yarns that have sides, and closed cloth only lamps that show its valleys. So
+        # these are asked for at once.
+        tuple(_then(shape, lamp) for shape in (_full, _then(_full, _closed)) for lamp in lamps),
         tuple(_width(w) for w in WIDTHS),
-        (_spun(1.0), _spun(-1.0)),
+        () if rig_known else moved,
+        tuple(map(_spun, SURFACE_ANGLES)),
         (_plied,),
-        (_yarns(unevenness=0.12, waviness=0.2), _yarns(unevenness=0.06, waviness=0.1)),
+        (_yarns(albedo_variation=0.7),),
+        (_yarns(unevenness=0.2, waviness=0.25),),
         (_yarns(flyaway_density=3000.0),),
     )
 
@@ -74,6 +102,10 @@ def looks_at(start: Seen, asked: tuple[tuple[Look, ...], ...], answers: tuple[in
     return start
 
 
+def _as_lit(seen: Seen) -> Seen:
+    return seen
+
+
 def _lamps() -> list[Look]:
     def ring(elevation: float) -> Look:
         return lambda seen: Seen(seen.fabric, ring_rig(seen.fabric.size, elevation))
@@ -82,6 +114,30 @@ def _lamps() -> list[Look]:
         return lambda seen: Seen(seen.fabric, ring_rig(seen.fabric.size, SIDE_ELEVATION, 1, azimuth))
 
     return [*map(ring, RING_ELEVATIONS), *map(side, SIDE_AZIMUTHS)]
+
+
+def _elevated(elevation: float) -> Look:
+    """The same lamps at another height."""
+
+    def look(seen: Seen) -> Seen:
+        rig = seen.rig or rig_for(seen.fabric.size)
+        return Seen(seen.fabric, ring_rig(seen.fabric.size, elevation, rig.lamps, rig.azimuth))
+
+    return look
+
+
+def _turned(angle: float) -> Look:
+    """The same lamp from another side."""
+
+    def look(seen: Seen) -> Seen:
+        rig = seen.rig or rig_for(seen.fabric.size)
+        return Seen(seen.fabric, replace(rig, azimuth=rig.azimuth + angle) if rig.lamps == 1 else seen.rig)
+
+    return look
+
+
+def _then(first: Look, second: Look) -> Look:
+    return lambda seen: second(first(seen))
 
 
 def _each(change: Callable[[YarnParameters, float], dict[str, Any]]) -> Look:
@@ -97,6 +153,17 @@ def _each(change: Callable[[YarnParameters, float], dict[str, Any]]) -> Look:
     return look
 
 
+def _full(seen: Seen) -> Seen:
+    """Round, orderly yarns that bulge, as wide as before."""
+
+    def change(yarn: YarnParameters, _: float) -> dict[str, Any]:
+        flattening = min(yarn.flattening, FULL_FLATTENING)
+        shape = {"flattening": flattening, "radius": yarn.radius * yarn.flattening / flattening}
+        return dict(FULL) | shape | {"fiber_count": FIBERS}
+
+    return _each(change)(seen)
+
+
 def _width(factor: float) -> Look:
     """Yarns narrower by a factor, first rounder, then thinner; wider ones become thicker too."""
 
@@ -107,16 +174,26 @@ def _width(factor: float) -> Look:
     return _each(change)
 
 
-def _spun(sign: float) -> Look:
-    """Fewer, twisted fibers; a yarn that is plied keeps its twist."""
+def _closed(seen: Seen) -> Seen:
+    """Yarns that touch their neighbours, thicker by as much as they are wider."""
+    fabric = seen.fabric
+    for system, spacing in zip(SYSTEMS, fabric.cell, strict=True):
+        yarn = fabric.system(system)
+        radius = max(yarn.radius, 0.5 * CLOSED_COVER * spacing / yarn.flattening)
+        fabric = replace(fabric, **{system: replace(yarn, radius=radius)})  # type: ignore[arg-type]
+    return Seen(fabric, seen.rig)
+
+
+def _spun(angle: float) -> Look:
+    """Fewer, twisted fibers, at an angle on the yarn's surface; a yarn that is plied keeps its twist."""
 
     def change(yarn: YarnParameters, along: float) -> dict[str, Any]:
-        fibers = {"fiber_count": min(yarn.fiber_count, SPUN_FIBERS)}
+        fibers = {"fiber_count": min(yarn.fiber_count, FIBERS)}
         if yarn.ply_count > 1:
             return fibers
         # On the surface, at half the yarn's width from its axis, fibers run at this angle.
-        turns = math.tan(SPUN_ANGLE) * along / (2.0 * math.pi * yarn.radius * yarn.flattening)
-        return fibers | {"twist": sign * min(turns, 0.6)}
+        turns = math.tan(angle) * along / (2.0 * math.pi * yarn.radius * yarn.flattening)
+        return fibers | {"twist": min(max(turns, -MOST_TWIST), MOST_TWIST)}
 
     return _each(change)
 

@@ -81,6 +81,7 @@ MOVES: dict[str, Move] = {
     "fiber_count": Move("log", 0.25, 20, 400),
     "flyaway_density": Move("sqrt", 20.0, 0.0, 2e4, spread=2.0),
     "flyaway_length": Move("log", 0.3, 1e-4, 3e-3),
+    "albedo_variation": Move("sqrt", 0.15, 0.0, 1.5, spread=2.0),
     "roughness_longitudinal": Move("log", 0.25, 0.1, 0.9),
     "roughness_azimuthal": Move("log", 0.25, 0.05, 0.6),
     "roughness_primary": Move("log", 0.3, 0.05, 0.9),

@@ -9,11 +9,9 @@ what the steps themselves show (Broyden 1965). The statistics are those of Li et
 
 from __future__ import annotations
 
-import json
 import math
-import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,32 +20,29 @@ from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
-from usdfab.files import whole_file
 from usdfab.fit.match_looks import Seen, looks_at, questions
+from usdfab.fit.match_pictures import MatchPictures
 from usdfab.fit.match_space import EXPOSURE, MOVES, MatchSpace
 from usdfab.fit.match_steps import broyden_update, damped_step, normal_equations, soft_l1
-from usdfab.imaging import denoise
-from usdfab.tracer import RenderSettings, Tracer
+from usdfab.fit.stage_file import load_stage, save_stage
 from usdfab.tracer.checkpoint import fingerprint
-from usdfab.usd.rig import Rig, sample_scene
+from usdfab.usd.rig import Rig
 
 if TYPE_CHECKING:
     from usdfab.fit.features import FeatureNet
-    from usdfab.fit.texture import Kind, Target
+    from usdfab.fit.texture import Kind
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-FORMAT = "usdfab-match/2"
+FORMAT = "usdfab-match/3"
 LONGEST_STEP = 2.0
 DAMPINGS = (0.01, 0.1, 1.0, 10.0)
 """Tried one after another until a step leads down; each iteration begins with the one that last did."""
 
-LIGHTS = (0.75, 1.0, 1.33, 1.75)
-"""Exposures, times the best so far, in which each first look is taken."""
-
-VARIED_CELLS = 16
-"""Crossings of all variants of the repeat together beyond which pictures show fewer variants."""
+LIGHTS = (0.75, 1.0, 1.33)
+"""Exposures in which each first look is taken, times that which makes it as bright as the photo on the mean: what
+suited the looks before does not suit other lamps."""
 
 SPREAD_OF_FIT = 0.3
 """A change of the loss by this part of itself is one standard deviation: about what another crop of a photo makes."""
@@ -102,7 +97,7 @@ class MatchSettings:
 
 
 DRAFTED = (
-    "radius", "flattening", "crimp", "twist", "unevenness", "waviness", "fiber_count", "flyaway_density",
+    "radius", "flattening", "crimp", "twist", "waviness", "irregularity", "flyaway_density", "albedo_variation",
     "roughness_azimuthal", "albedo", EXPOSURE,
 )  # fmt: skip
 """What a draft moves: what one round can settle, and is seen at its resolution."""
@@ -163,61 +158,6 @@ class _Point:
     loss: float
 
 
-class _Pictures:
-    """Pictures of fabrics, and how their statistics differ from the target's."""
-
-    def __init__(self, target: Target, settings: MatchSettings) -> None:
-        self.target, self.settings = target, settings
-        weights = []
-        for statistic, upper in zip(target.statistics, self._upper(target.statistics), strict=True):
-            # Symmetric matrices: each pair off the diagonal stands for two entries.
-            shares = np.full(len(upper[0]), 2.0, dtype=np.float32)
-            shares[upper[0] == upper[1]] = 1.0
-            weights.append(shares / np.float32(statistic[0].numel() * len(target.statistics)))
-        # The mean colour counts as much as all the texture, as in Li et al. 2024, 7.2.
-        weights.append(np.full(3, 1.0 / 3.0, dtype=np.float32))
-        self.weights: Singles = np.concatenate(weights)
-        self.mean = target.mean_color.float().reshape(3).numpy()
-
-    @staticmethod
-    def _upper(statistics: tuple) -> list[tuple[NDArray, NDArray]]:
-        return [np.triu_indices(s.shape[-1]) if s.ndim == 3 else (np.arange(s.shape[-1]),) * 2 for s in statistics]
-
-    def picture(self, fabric: FabricParameters, rig: Rig | None) -> Singles:
-        """(H, W, 3) linear, denoised, at exposure 1."""
-        repeat = math.prod(fabric.repeat())
-        # Statistics need only so many different crossings; each is fibers to build and to keep.
-        fewer = replace(fabric, variants=max(1, min(fabric.variants, VARIED_CELLS // repeat)))
-        scene = sample_scene(fewer, rig)
-        width = self.settings.width
-        size = (width, max(1, round(width * fabric.size[1] / fabric.size[0])))
-        render = Tracer(scene).render(
-            scene.cameras[0], RenderSettings(size, spp=self.settings.spp, seed=self.settings.seed)
-        )
-        return denoise(render.pixels, render.albedo, render.normal)
-
-    def residuals(self, picture: Singles, exposure: float) -> Singles:
-        """(R,) differences of the statistics from the target's, each matrix in units of the target's mean entry, and of
-        the mean colours, in units of the mean over the target's channels."""
-        import torch
-
-        from usdfab.fit.texture import rolled_off, texture_statistics
-
-        target = self.target
-        with torch.inference_mode():
-            image = torch.from_numpy(np.float32(exposure) * picture).permute(2, 0, 1)[None]
-            found = texture_statistics(image, target.net, target.levels, target.kind)
-            parts = []
-            for ours, theirs, scale, upper in zip(
-                found, target.statistics, target.scales, self._upper(target.statistics), strict=True
-            ):
-                difference = ((ours - theirs) / scale)[0].numpy()
-                parts.append(difference[upper] if difference.ndim == 2 else difference)
-            color = rolled_off(image).mean(dim=(0, 2, 3)).numpy() - self.mean
-            parts.append(color / max(float(self.mean.mean()), 1e-3))
-        return np.concatenate(parts).astype(np.float32)
-
-
 def match_photo(
     start: FabricParameters,
     goal: NDArray,
@@ -260,11 +200,13 @@ def match_photo(
     from usdfab.fit.texture import Target
 
     picture = torch.from_numpy(np.ascontiguousarray(goal, dtype=np.float32)).permute(2, 0, 1)
-    pictures = _Pictures(Target.from_image(picture, net, settings.levels, settings.kind), settings)
+    pictures = MatchPictures(
+        Target.from_image(picture, net, settings.levels, settings.kind), settings.width, settings.spp, settings.seed
+    )
     identity = fingerprint(start, np.asarray(goal, dtype=np.float32), settings, float(exposure), rig, rig_known)
     state = None
     if checkpoint is not None and checkpoint.exists():
-        state = _load(checkpoint, identity)
+        state = load_stage(checkpoint, FORMAT, identity, _state)
     search = _Search(Seen(start, rig), rig_known, exposure, pictures, settings, state, progress)
     space, state = search.space, search.state
     interrupted = False
@@ -274,7 +216,7 @@ def match_photo(
         while state.round < settings.iterations:
             search.round()
             if checkpoint is not None:
-                _save(checkpoint, identity, state)
+                save_stage(checkpoint, FORMAT, identity, _arrays(state))
     except KeyboardInterrupt:
         interrupted = True
     deviations = state.deviations if state.deviations is not None else np.zeros(len(space.names))
@@ -290,7 +232,7 @@ class _Search:
         start: Seen,
         rig_known: bool,
         exposure: float,
-        pictures: _Pictures,
+        pictures: MatchPictures,
         settings: MatchSettings,
         state: _State | None,
         progress: Callable[[int, int, float], None] | None,
@@ -304,6 +246,7 @@ class _Search:
         self._each = len(self.space.names) + settings.steps * len(DAMPINGS)
         self._done = self.state.round * self._each
         self.loss = math.inf
+        self._seen: list[Seen] = []
 
     def begin(self) -> None:
         """Take the first looks, or go back to the point where the search stood."""
@@ -313,29 +256,32 @@ class _Search:
             self._done += sum(map(len, self.questions))
             self.picture, self.residuals, self.loss = self._look(state.point)
             return
-        self._try((), exposure, lights=(1.0,))
+        self._try((), exposure)
         state.losses.append(self.loss)
         for question in self.questions:
             before, kept = self.loss, state.answers
             state.answers = (*kept, -1)
             for answer in range(len(question)):
-                self._try((*kept, answer), exposure, lights=LIGHTS)
+                self._try((*kept, answer), exposure)
             if self.loss < before:
                 state.losses.append(self.loss)
         self._settle(exposure)
 
-    def _try(self, answers: tuple[int, ...], exposure: float, lights: tuple[float, ...]) -> None:
-        """Look at some answers in several lights, about that which suited the best answers so far."""
+    def _try(self, answers: tuple[int, ...], exposure: float) -> None:
+        """Look at some answers in several lights; the start also in its own."""
         seen = looks_at(self.start, self.questions, answers)
-        picture = self.pictures.picture(seen.fabric, seen.rig)
         self._done += 1
-        light_before = self.state.light
-        for light in lights:
-            residuals = self.pictures.residuals(picture, exposure * light_before * light)
+        if answers and seen in self._seen:
+            return
+        self._seen.append(seen)
+        picture = self.pictures.picture(seen.fabric, seen.rig)
+        mean = float(self.pictures.mean.mean()) / max(exposure * float(picture.mean()), 1e-6)
+        for light in (*(mean * factor for factor in LIGHTS), *(() if answers else (1.0,))):
+            residuals = self.pictures.residuals(picture, exposure * light)
             loss = soft_l1(residuals, self.pictures.weights)
             if loss < self.loss:
                 self.picture, self.residuals, self.loss = picture, residuals, loss
-                self.state.answers, self.state.light = answers, light_before * light
+                self.state.answers, self.state.light = answers, light
         self._tell(self.loss)
 
     def _settle(self, exposure: float) -> None:
@@ -415,45 +361,15 @@ class _Search:
         return np.sqrt(2.0 * SPREAD_OF_FIT * self.loss * np.diag(np.linalg.inv(hessian)))
 
 
-def _save(path: Path, identity: str, state: _State) -> None:
-    about = json.dumps({"format": FORMAT, "identity": identity, "round": state.round})
-    numbers = {"answers": state.answers, "light": state.light, "damping": state.damping, "point": state.point}
-    try:
-        with whole_file(path) as temporary, temporary.open("wb") as stream:
-            np.savez(stream, about=about, losses=state.losses, deviations=state.deviations, **numbers)  # type: ignore[arg-type]
-    except OSError as error:
-        raise UsdfabError(
-            f"cannot be written ({error.strerror or error})", place=str(path), remedy="make room or use another disk"
-        ) from error
+def _arrays(state: _State) -> dict[str, NDArray]:
+    return {f.name: np.asarray(getattr(state, f.name)) for f in fields(state) if getattr(state, f.name) is not None}
 
 
-def _load(path: Path, identity: str) -> _State:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            about = json.loads(str(data["about"]))
-            if about["format"] != FORMAT:
-                raise ValueError
-            state = _State(
-                int(about["round"]), data["point"], data["losses"].tolist(), tuple(data["answers"].tolist()),
-                float(data["light"]),
-                int(data["damping"]), data["deviations"],
-            )  # fmt: skip
-            same = about["identity"] == identity
-    except OSError as error:
-        raise UsdfabError(f"cannot be read ({error.strerror or error})", place=str(path)) from error
-    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise UsdfabError(
-            "this is no unfinished match of this version, or it is damaged",
-            place=str(path),
-            remedy="start anew with --overwrite",
-        ) from error
-    if not same:
-        raise UsdfabError(
-            "the unfinished match is of another photo, other options or another start",
-            place=str(path),
-            remedy="give the same options, or start anew with --overwrite",
-        )
-    return state
+def _state(arrays: dict[str, NDArray]) -> _State:
+    return _State(
+        int(arrays["round"]), arrays["point"], arrays["losses"].tolist(), tuple(arrays["answers"].tolist()),
+        float(arrays["light"]), int(arrays["damping"]), arrays["deviations"],
+    )  # fmt: skip
 
 
 def checked_match_quality(quality: str, seed: int = 0) -> MatchSettings:

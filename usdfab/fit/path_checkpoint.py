@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from usdfab.errors import UsdfabError
-from usdfab.files import whole_file
+from usdfab.fit.stage_file import load_stage, save_stage
 
 Floats = NDArray[np.float64]
 
@@ -76,14 +73,7 @@ def save_state(path: Path, identity: str, state: State, passes: dict[str, NDArra
     """
     arrays: dict = {f.name: np.asarray(getattr(state, f.name)) for f in fields(state)}
     arrays |= {f"pass_{key}": value for key, value in passes.items()}
-    arrays["about"] = np.array(json.dumps({"format": FORMAT, "identity": identity}))
-    try:
-        with whole_file(path) as temporary, temporary.open("wb") as file:
-            np.savez(file, **arrays)
-    except OSError as error:
-        raise UsdfabError(
-            f"cannot be written ({error.strerror or error})", place=str(path), remedy="make room or choose another disk"
-        ) from error
+    save_stage(path, FORMAT, identity, arrays)
 
 
 def load_state(path: Path, identity: str) -> tuple[State, dict[str, NDArray]]:
@@ -94,32 +84,15 @@ def load_state(path: Path, identity: str) -> tuple[State, dict[str, NDArray]]:
     UsdfabError
         If the file is damaged, something else, or of a run with other inputs.
     """
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            about = json.loads(str(data["about"]))
-            if about["format"] != FORMAT:
-                raise ValueError
-            found = about["identity"]
-            values = {f.name: data[f.name] for f in fields(State)}
-            passes = {key.removeprefix("pass_"): data[key] for key in data.files if key.startswith("pass_")}
-        state = State(
-            int(values.pop("iteration")), int(values.pop("failures")), float(values.pop("rate")), **values
-        )  # fmt: skip
-        n = len(state.coordinates)
-        if state.losses.shape != (state.iteration, 4) or state.history.shape != (state.iteration, n):
-            raise ValueError
-    except OSError as error:
-        raise UsdfabError(f"cannot be read ({error.strerror or error})", place=str(path)) from error
-    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise UsdfabError(
-            "this is no unfinished stage of this version, or it is damaged",
-            place=str(path),
-            remedy="remove it and start again",
-        ) from error
-    if found != identity:
-        raise UsdfabError(
-            "the unfinished stage belongs to another photo, fabric, rig or settings",
-            place=str(path),
-            remedy="remove it, or give what it was begun with",
-        )
-    return state, passes
+    return load_stage(path, FORMAT, identity, _read)
+
+
+def _read(arrays: dict[str, NDArray]) -> tuple[State, dict[str, NDArray]]:
+    values = {f.name: arrays[f.name] for f in fields(State)}
+    state = State(
+        int(values.pop("iteration")), int(values.pop("failures")), float(values.pop("rate")), **values
+    )  # fmt: skip
+    n = len(state.coordinates)
+    if state.losses.shape != (state.iteration, 4) or state.history.shape != (state.iteration, n):
+        raise ValueError
+    return state, {key.removeprefix("pass_"): array for key, array in arrays.items() if key.startswith("pass_")}

@@ -15,7 +15,7 @@ from usdfab.fabric.parameters import YARN_PARAMETERS, Parameter
 from usdfab.fabric.weave import MAX_REPEAT
 from usdfab.usd.registration import FABRIC_API, YARN_API
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 NAMESPACE = "usdfab"
 YARN_NAMESPACE = f"{NAMESPACE}:yarn"
 _TYPES = {"float": "double", "int": "int", "color": "color3d", "colors": "color3d[]"}
