@@ -174,10 +174,10 @@ def _next(state: State, rate: float) -> Tensor:
 def _set_back(state: State, rate: float, number: float, names: Sequence[str], bad: Sequence[str]) -> State:
     finite = math.isfinite(number)
     if not state.steps:
-        whose = f"the gradient to {_few(bad)}" if finite else "the loss"
+        whose = f"the gradient to {few_names(bad)}" if finite else "the loss"
         raise UsdfabError(f"{whose} is not finite at the start", remedy="start from other parameters")
     moved = names[int((state.trial - state.vector).abs().argmax())]
-    which = f"gradient to {_few(bad)} was" if finite else f"loss, after {moved} moved most, was"
+    which = f"gradient to {few_names(bad)} was" if finite else f"loss, after {moved} moved most, was"
     note = f"iteration {state.iteration + 1}: the {which} not finite; half the step from there on"
     state = replace(
         state,
@@ -189,7 +189,8 @@ def _set_back(state: State, rate: float, number: float, names: Sequence[str], ba
     return replace(state, trial=_next(state, rate))
 
 
-def _few(names: Sequence[str]) -> str:
+def few_names(names: Sequence[str]) -> str:
+    """The first three of them, and how many more."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 

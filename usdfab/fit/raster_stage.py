@@ -17,15 +17,39 @@ from usdfab.fabric.optics import optics_of
 from usdfab.fit.descent import Progress, State, descend, first_state, load_state
 from usdfab.fit.features import FeatureNet, fast_dtype, load_features
 from usdfab.fit.losses import roughness_prior
+from usdfab.fit.newton import gauss_newton
+from usdfab.fit.raster.curves import Shapes
+from usdfab.fit.raster.multiple import DiffuseMap
 from usdfab.fit.raster.renderer import RasterRenderer, RasterSettings, raster_renderer
+from usdfab.fit.raster.shade import Look
 from usdfab.fit.raster.unconstrained import FREE_NAMES, Parameters, parameters_of
+from usdfab.fit.raster_multiple import measured_diffuse
 from usdfab.fit.straighten import straightened as straightened
-from usdfab.fit.texture import DEFAULT_KIND, LEVELS, Kind, Target, color_loss, texture_loss
+from usdfab.fit.texture import (
+    DEFAULT_KIND,
+    LEVELS,
+    Kind,
+    Target,
+    color_loss,
+    residual_weights,
+    residuals,
+    texture_loss,
+)
 from usdfab.tracer.checkpoint import fingerprint
 from usdfab.usd.rig import Rig, sample_scene
 
 Floats = NDArray[np.float64]
 Quality = Literal["draft", "standard", "paper"]
+
+Steps = Literal["newton", "adam"]
+
+PRIOR_UNIT = 0.02
+"""Of the loss: twice what one standard deviation from a prior costs where steps are ``newton``. Another draw of the
+fibers alone costs ten times that."""
+
+SPREADS = {"gain": 0.15}
+"""Standard deviations of the priors about the start in the space without bounds; 1 for what is not here, a quarter of
+the range at its middle."""
 
 START_DIFFUSE = (0.02, 0.9)
 """Range that k_d is given before the first iteration."""
@@ -39,12 +63,22 @@ class StageSettings:
     ----------
     width:
         Of the target and the render, pixels; the scale follows from the photo's physical width.
-    supersampling, iterations, rate:
-        Squared pixels per pixel; Adam's steps and their size in the space without bounds. The paper says 0.01 and not
-        of what; there a number in the middle of its range moves by 0.25 % of the range, and at most by a fifth of it
-        in 75 steps. With 0.03 what starts 20 % of its range off can come back.
+    supersampling:
+        Squared pixels per pixel.
+    steps:
+        ``newton``: Gauss-Newton, see ``newton``; ``adam``: as the paper.
+    iterations:
+        Adam's steps, or rounds of Gauss-Newton, each of which takes a picture for each number.
+    rate:
+        Size of Adam's steps in the space without bounds. The paper says 0.01 and not of what; there a number in the
+        middle of its range moves by 0.25 % of the range, and at most by a fifth of it in 75 steps. With 0.03 what
+        starts 20 % of its range off can come back.
+    tied:
+        Whether k_d is the multiple scattering that follows from C, measured with the path tracer before the first
+        iteration, see ``raster.multiple``; else it is found like the rest, as in the paper.
     texture, color, prior:
-        Weights of the losses (eq. 11: all 1); 0 leaves one out. ``prior`` counts for satin only, see ``losses``.
+        Weights of the losses (eq. 11: all 1); 0 leaves one out. ``prior`` is for satin only, see ``losses``; where
+        steps are ``newton`` it also holds what the picture does not tell near its start, in units of ``PRIOR_UNIT``.
     free:
         What moves; the rest stays as it starts.
     single, diffuse:
@@ -55,8 +89,10 @@ class StageSettings:
 
     width: int = 360
     supersampling: int = 2
-    iterations: int = 75
+    steps: Steps = "newton"
+    iterations: int = 5
     rate: float = 0.03
+    tied: bool = True
     texture: float = 1.0
     color: float = 1.0
     prior: float = 1.0
@@ -68,9 +104,9 @@ class StageSettings:
 
 
 QUALITIES: dict[str, StageSettings] = {
-    "draft": StageSettings(width=128, supersampling=1, iterations=20, rate=0.05, levels=(1, 2, 4), kind="gram"),
+    "draft": StageSettings(width=128, supersampling=2, iterations=2, levels=(1, 2, 4), kind="gram"),
     "standard": StageSettings(),
-    "paper": StageSettings(width=720, iterations=75),
+    "paper": StageSettings(width=720, steps="adam", iterations=75, tied=False),
 }
 """What ``--quality`` means here.
 
@@ -157,24 +193,32 @@ def refine_by_raster(
     picture = torch.from_numpy(np.ascontiguousarray(target, dtype=np.float32)).permute(2, 0, 1)
     goal = Target.from_image(picture, net, settings.levels, settings.kind)
     renderer = _renderer(fabric, settings, rig)
+    job = fingerprint(fabric, np.asarray(target), np.asarray(diffuse), replace(settings, iterations=0), rig)
+    tie = measured_diffuse(fabric, renderer, rig) if settings.tied and settings.single and settings.diffuse else None
     if diffuse is None:
         diffuse = matching_diffuse(renderer, np.asarray(target).mean(axis=(0, 1)))
-    parameters = parameters_of(fabric, diffuse, free=_moving(settings))
-    job = fingerprint(fabric, np.asarray(target), np.asarray(diffuse), replace(settings, iterations=0), rig)
+    parameters = parameters_of(fabric, diffuse, free=_moving(settings, tie is not None))
     if resume and checkpoint is not None and checkpoint.exists():
         state = load_state(checkpoint, job)
     else:
         state = first_state(parameters.vector())
-    loss = _loss(renderer, parameters, goal, settings)
-    state, interrupted = descend(
-        loss, state, settings.iterations, settings.rate, parameters.free_names,
-        checkpoint=checkpoint, job=job, progress=progress,
-    )  # fmt: skip
-    return _result(renderer, parameters, state, interrupted)
+    picture_of = _Pictures(renderer, parameters, tie)
+    if settings.steps == "adam":
+        state, interrupted = descend(
+            _loss(picture_of, goal, settings), state, settings.iterations, settings.rate, parameters.free_names,
+            checkpoint=checkpoint, job=job, progress=progress,
+        )  # fmt: skip
+    else:
+        state, interrupted = gauss_newton(
+            _residuals(picture_of, goal), residual_weights(goal, settings.texture, settings.color),
+            _prior(parameters, settings), state, settings.iterations, parameters.free_names,
+            checkpoint=checkpoint, job=job, progress=progress,
+        )  # fmt: skip
+    return _result(picture_of, state, interrupted)
 
 
-def _moving(settings: StageSettings) -> tuple[str, ...]:
-    without = set() if settings.diffuse else {"diffuse"}
+def _moving(settings: StageSettings, tied: bool) -> tuple[str, ...]:
+    without = {"diffuse"} if tied or not settings.diffuse else set()
     if not settings.single:
         without |= {"albedo", "roughness_longitudinal", "roughness_azimuthal", "roughness_primary"}
     return tuple(name for name in settings.free if name not in without)
@@ -191,14 +235,29 @@ def _renderer(fabric: FabricParameters, settings: StageSettings, rig: Rig | None
     return raster_renderer(sample_scene(fabric, rig), raster)
 
 
-def _loss(
-    renderer: RasterRenderer, parameters: Parameters, goal: Target, settings: StageSettings
-) -> Callable[[torch.Tensor], torch.Tensor]:
-    weave_class = parameters.fabric.weave.classify()
+@dataclass(frozen=True, eq=False)
+class _Pictures:
+    """Pictures of a vector without bounds; ``tie`` gives k_d where C does."""
+
+    renderer: RasterRenderer
+    parameters: Parameters
+    tie: DiffuseMap | None
+
+    def look(self, vector: torch.Tensor) -> tuple[Shapes, Look]:
+        shapes, look = self.parameters.of(self.parameters.natural(vector))
+        return shapes, look if self.tie is None else replace(look, diffuse=self.tie(look.albedo))
+
+    def __call__(self, vector: torch.Tensor) -> tuple[torch.Tensor, Look]:
+        """(3, H, W), and what it shows."""
+        shapes, look = self.look(vector)
+        return self.renderer.image(shapes, look).permute(2, 0, 1), look
+
+
+def _loss(picture_of: _Pictures, goal: Target, settings: StageSettings) -> Callable[[torch.Tensor], torch.Tensor]:
+    weave_class = picture_of.parameters.fabric.weave.classify()
 
     def loss(vector: torch.Tensor) -> torch.Tensor:
-        shapes, look = parameters.of(parameters.natural(vector))
-        image = renderer.image(shapes, look).permute(2, 0, 1)
+        image, look = picture_of(vector)
         if not image.isfinite().all():
             # The losses refuse such a picture; to the descent it is a step too far.
             return (vector * torch.nan).sum()
@@ -212,13 +271,35 @@ def _loss(
     return loss
 
 
-def _result(renderer: RasterRenderer, parameters: Parameters, state: State, interrupted: bool) -> StageResult:
+def _residuals(picture_of: _Pictures, goal: Target) -> Callable[[torch.Tensor], torch.Tensor]:
+    def found(vector: torch.Tensor) -> torch.Tensor:
+        image, _ = picture_of(vector)
+        return residuals(image, goal) if image.isfinite().all() else image.new_full((1,), torch.nan)
+
+    return found
+
+
+def _prior(parameters: Parameters, settings: StageSettings) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Of the start, and of the weave's roughnesses."""
+    start = parameters.vector()
+    kinds = [name.split(".")[-1].split("[")[0] for name in parameters.free_names]
+    spread = torch.tensor([SPREADS.get(kind, 1.0) for kind in kinds], dtype=torch.float64)
+    weave_class = parameters.fabric.weave.classify()
+
+    def prior(vector: torch.Tensor) -> torch.Tensor:
+        _, look = parameters.of(parameters.natural(vector))
+        about = 0.5 * ((vector - start) / spread).square().sum()
+        return PRIOR_UNIT * settings.prior * (about + roughness_prior(weave_class, look.roughness))
+
+    return prior
+
+
+def _result(picture_of: _Pictures, state: State, interrupted: bool) -> StageResult:
     with torch.no_grad():
-        natural = parameters.natural(state.best)
-        shapes, look = parameters.of(natural)
-        render = renderer.image(shapes, look).float().numpy()
+        image, look = picture_of(state.best)
+        render = np.ascontiguousarray(image.permute(1, 2, 0).float().numpy())
     return StageResult(
-        parameters.fabric_of(natural),
+        picture_of.parameters.fabric_of(picture_of.parameters.natural(state.best)),
         look.diffuse.numpy().copy(),
         float(look.gain),
         state.losses,

@@ -158,6 +158,44 @@ def color_loss(render: Tensor, target: Target) -> Tensor:
     return (image.mean(dim=(2, 3)) - mean.to(image)).abs().mean() / mean.mean().clamp(min=1e-3).to(image)
 
 
+def residuals(render: Tensor, target: Target) -> Tensor:
+    """(R,) what ``texture_loss`` and ``color_loss`` are means of absolute values of, each off-diagonal pair once.
+
+    Differences of the statistics over the target's mean entry, then of the mean colours over the target's mean.
+
+    Parameters
+    ----------
+    render:
+        (3, H, W), as for ``texture_loss``.
+    """
+    image = _checked(render, target.net, target.levels, "the render")
+    found = texture_statistics(image, target.net, target.levels, target.kind)
+    parts = []
+    for ours, theirs, scale in zip(found, target.statistics, target.scales, strict=True):
+        difference = ((ours - theirs) / scale)[0]
+        parts.append(difference[_upper(difference)] if difference.ndim == 2 else difference)
+    mean = target.mean_color.to(image)
+    parts.append((rolled_off(image).mean(dim=(0, 2, 3)) - mean) / mean.mean().clamp(min=1e-3))
+    return torch.cat([part.float() for part in parts])
+
+
+def residual_weights(target: Target, texture: float = 1.0, color: float = 1.0) -> Tensor:
+    """(R,) weights with which the absolute values of ``residuals`` add up to the weighted sum of the two losses."""
+    parts = []
+    for statistic in target.statistics:
+        entries = statistic[0]
+        shares = entries.new_full(entries.shape, texture / (entries.numel() * len(target.statistics)))
+        if entries.ndim == 2:
+            # A pair off the diagonal stands for two entries.
+            shares = (2.0 * shares - shares.diagonal().diag())[_upper(entries)]
+        parts.append(shares.float())
+    return torch.cat([*parts, target.mean_color.new_full((3,), color / 3.0).float()])
+
+
+def _upper(matrix: Tensor) -> tuple[Tensor, ...]:
+    return tuple(torch.triu_indices(*matrix.shape))
+
+
 def texture_statistics(image: Tensor, net: FeatureNet, levels: Sequence[int], kind: Kind) -> list[Tensor]:
     """Statistics of (B, 3, H, W) linear images: for each level, for each tap, Gram or mean and covariance matrices."""
     result: list[Tensor] = []
