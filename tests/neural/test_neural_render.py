@@ -23,7 +23,8 @@ from usdfab.neural.gbuffer import NUMBERS, PLACE, SIZE, TAGS, VIEW, fill, pixel_
 from usdfab.neural.material_file import Weights
 from usdfab.neural.network import KINDS
 from usdfab.neural.render import places_of, render
-from usdfab.neural.stage_scene import NeuralScene, build, learned_material, mip_levels, reversed_material
+from usdfab.neural.rendered_material import learned_material, reversed_material
+from usdfab.neural.stage_scene import NeuralScene, build, mip_levels
 from usdfab.neural.surface_from_fabric import surface_from_fabric
 from usdfab.neural.surface_material import SurfaceMaterial
 from usdfab.tracer.render import pack_view

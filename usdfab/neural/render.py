@@ -106,7 +106,8 @@ def shade_band(
                 found = scene.plans[number].decode(queries[those])
                 albedo = scene.albedo[number // 4, number % 2]
                 # A print colours what goes through fibers, not what they mirror.
-                value = numbers[those, TINT : TINT + 3] * (found[:, :2] @ albedo[:2]) + found[:, 2:] @ albedo[2:]
+                tinted = scene.tinted[number // 4][:, None] * albedo
+                value = numbers[those, TINT : TINT + 3] * (found @ tinted) + found @ (albedo - tinted)
                 radiance[those] += weights[those] * value
                 asked += len(those)
     return radiance.reshape(y1 - y0, x1 - x0, 3), asked

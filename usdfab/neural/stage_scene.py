@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
+from usdfab.fabric import FabricParameters
+from usdfab.neural.asset_file import load_asset_network
+from usdfab.neural.asset_network import TINTED, AssetMaterial
 from usdfab.neural.decoder import Plan, plans_of
 from usdfab.neural.material_file import Weights
+from usdfab.neural.rendered_material import learned_material, reversed_material
 from usdfab.neural.surface_from_fabric import surface_from_fabric
-from usdfab.neural.surface_material import PAPER_GAP, SurfaceMaterial
+from usdfab.neural.surface_material import SurfaceMaterial
 from usdfab.tracer import embree
 from usdfab.tracer.embree import EmbreeScene
 from usdfab.tracer.intrinsics import filter_address
@@ -26,8 +29,6 @@ from usdfab.usd.scene import DistantLight, DomeLight, Light, PointLight, Scene, 
 
 LARGEST_REPEAT = 16
 """Most ends or picks in a tile: beyond, a yarn is less than four pixels wide in what the encoder sees."""
-
-LARGEST_TWIST = math.radians(30.0)
 
 DOME_PLACES, AREA_PLACES = 16, 4
 """Directions of a dome, places on a light with an extent: of each sample."""
@@ -53,7 +54,10 @@ class NeuralScene:
     plans: 4 to each fabric
         Front lit from the front, from behind; back lit from its own front, from behind.
     albedo: (fabrics, 2, 4, 3)
-        Of C_warp, C_weft, S_warp, S_weft, for light from the front and from behind.
+        Of C_warp, C_weft, S_warp, S_weft, for light from the front and from behind; of a fabric with a network of its
+        own: what makes its columns colours (``AssetMaterial.albedo``).
+    tinted: (fabrics, 4)
+        Which of an answer's four numbers are of light that a print colours: 1, else 0.
     mips, repeats:
         See ``gbuffer.fill``.
     embree:
@@ -63,6 +67,7 @@ class NeuralScene:
     world: World
     plans: list[Plan]
     albedo: NDArray[np.float64]
+    tinted: NDArray[np.float64]
     mips: NDArray[np.int32]
     repeats: NDArray[np.float64]
     lights: list[PlacedLight]
@@ -70,24 +75,10 @@ class NeuralScene:
     warnings: tuple[str, ...]
 
 
-def reversed_material(material: SurfaceMaterial) -> SurfaceMaterial:
-    """The cloth turned about its warp: what was below is on top, left is right; a twist stays what it is."""
-    return replace(material, weave=~material.weave[:, ::-1])
-
-
-def learned_material(material: SurfaceMaterial) -> tuple[SurfaceMaterial, float]:
-    """A material among those that networks are trained on, and by how much more of the cloth its yarns should cover.
-
-    Networks know one gap and twists up to 30 degrees (Table 2 of Chen et al. 2024).
-    """
-    twist = tuple(float(np.clip(t, -LARGEST_TWIST, LARGEST_TWIST)) for t in material.twist)
-    known = replace(material, twist=(twist[0], twist[1]), gap=PAPER_GAP)
-    return known, (1.0 - material.gap) / (1.0 - PAPER_GAP)
-
-
 def build(
-    scene: Scene, networks: Mapping[str, Weights], pictures: Mapping[str, NDArray], strict: bool = False
-) -> NeuralScene:
+    scene: Scene, networks: Mapping[str, Weights], pictures: Mapping[str, NDArray], strict: bool = False,
+    own: bool = True,
+) -> NeuralScene:  # fmt: skip
     """A scene made ready.
 
     Parameters
@@ -98,11 +89,14 @@ def build(
         Of dome lights, by path.
     strict:
         Whether what cannot be drawn is an error; else it is one of ``warnings``.
+    own:
+        Whether fabrics that have networks of their own (``FabricParameters.neural_weights``) are drawn with them.
 
     Raises
     ------
     UsdfabError
-        If there is nothing to see or no light, a cloth has no uv, or a weave is larger than the encoder takes.
+        If there is nothing to see or no light, a cloth has no uv, a weave is larger than the encoder takes, or
+        a fabric's own network cannot be read.
     """
     if not scene.lights:
         raise UsdfabError("the stage has no light", place=scene.path, remedy="add a UsdLux light, e.g. a DomeLight")
@@ -117,9 +111,14 @@ def build(
         if material.fabric < 0 and (np.any(material.emissive) or "emissiveColor" in material.textures):
             left_out("a surface that glows lights nothing in the neural backend", material.path)
     _check_uv(scene)
+    assets = asset_networks(scene, left_out) if own else {}
     materials: list[SurfaceMaterial] = []
     albedo = np.zeros((len(scene.fabrics), 2, 4, 3))
+    tinted = np.tile([1.0, 1.0, 0.0, 0.0], (len(scene.fabrics), 1))
     for number, surface in enumerate(scene.fabrics):
+        if number in assets:
+            albedo[number], tinted[number] = assets[number].albedo, TINTED
+            continue
         cloth, colors = surface_from_fabric(surface.fabric)
         cloth, cover = learned_material(cloth)
         if max(cloth.rows, cloth.columns) > LARGEST_REPEAT:
@@ -133,7 +132,35 @@ def build(
     if materials:
         both = [plans_of(networks[kind].network, materials) for kind in ("reflection", "transmission")]
         plans = [both[kind][k] for k in range(len(materials)) for kind in (0, 1)]
-    return _assemble(scene, plans, albedo, [*warnings], pictures, strict)
+    shared = iter(plans)
+    plans = [
+        plan
+        for number in range(len(scene.fabrics))
+        for plan in (assets[number].plans() if number in assets else [next(shared) for _ in range(4)])
+    ]
+    tiles = [fabric_tile(surface.fabric, assets.get(number)) for number, surface in enumerate(scene.fabrics)]
+    return _assemble(scene, plans, albedo, tinted, tiles, [*warnings], pictures, strict)
+
+
+def asset_networks(scene: Scene, left_out: Callable[[str, str], None]) -> dict[int, AssetMaterial]:
+    """The networks of fabrics' own, by the fabrics' numbers; ``left_out`` is told (problem, place) of stale ones."""
+    found: dict[int, AssetMaterial] = {}
+    for number, surface in enumerate(scene.fabrics):
+        file = surface.fabric.neural_weights
+        if not file:
+            continue
+        material = load_asset_network(file, surface.fabric)
+        if material is None:
+            left_out(f"the fabric is not what {file} was trained on, which is not used", surface.path)
+        else:
+            found[number] = material
+    return found
+
+
+def fabric_tile(fabric: FabricParameters, asset: AssetMaterial | None) -> tuple[float, float]:
+    """Width and height in metres of what queries of a fabric call one tile."""
+    ends, picks = asset.tile if asset else (fabric.weave.ends, fabric.weave.picks)
+    return fabric.cell[0] * ends, fabric.cell[1] * picks
 
 
 def _check_uv(scene: Scene) -> None:
@@ -146,8 +173,8 @@ def _check_uv(scene: Scene) -> None:
 
 
 def _assemble(
-    scene: Scene, plans: list[Plan], albedo: NDArray[np.float64], warnings: list[str],
-    pictures: Mapping[str, NDArray], strict: bool,
+    scene: Scene, plans: list[Plan], albedo: NDArray[np.float64], tinted: NDArray[np.float64],
+    fabric_tiles: Sequence[tuple[float, float]], warnings: list[str], pictures: Mapping[str, NDArray], strict: bool,
 ) -> NeuralScene:  # fmt: skip
     maps = [surface.albedo_map for surface in scene.fabrics]
     wanted = [t for m in scene.materials if m.fabric < 0 for t in m.textures.values()] + [m for m in maps if m]
@@ -172,14 +199,13 @@ def _assemble(
         addresses,  # type: ignore[arg-type]
     )  # fmt: skip
     repeats = np.ones((max(len(scene.fabrics), 1), 2))
-    for row, surface in zip(repeats, scene.fabrics, strict=False):
-        fabric = surface.fabric
-        row[:] = fabric.cell[0] * fabric.weave.ends, fabric.cell[1] * fabric.weave.picks
+    for row, tile in zip(repeats, fabric_tiles, strict=False):
+        row[:] = tile
     lights = [
         PlacedLight(pack_lights(replace(scene, lights=(light,)), dict(pictures)), _places(light))
         for light in scene.lights
     ]
-    return NeuralScene(world, plans, albedo, mips, repeats, lights, embree_scene, (*warnings, *said, *more))
+    return NeuralScene(world, plans, albedo, tinted, mips, repeats, lights, embree_scene, (*warnings, *said, *more))
 
 
 def _places(light: Light) -> int:

@@ -15,7 +15,7 @@ from usdfab.fabric.parameters import YARN_PARAMETERS, Parameter
 from usdfab.fabric.weave import MAX_REPEAT
 from usdfab.usd.registration import FABRIC_API, YARN_API
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 NAMESPACE = "usdfab"
 YARN_NAMESPACE = f"{NAMESPACE}:yarn"
 _TYPES = {"float": "double", "int": "int", "color": "color3d", "colors": "color3d[]"}
@@ -147,6 +147,11 @@ FABRIC_ATTRIBUTES: tuple[SchemaAttribute, ...] = (
         "Image that multiplies the fiber albedo, looked up with the texture coordinates of the cloth, repeated beyond "
         "them. OpenEXR and Radiance files are linear Rec. 709, others sRGB. Not authored, or empty: none. The primvar "
         "usdfab:albedo of a mesh multiplies the albedo likewise.", since=2,
+    ),
+    SchemaAttribute(
+        "neural:weights", "neural_weights", "asset", "", "@@", "Neural weights", "Fabric",
+        "File of `usdfab train neural --asset` with a network of this fabric's own, for the neural backend. It is used "
+        "only as long as the fabric is the one that it was trained on. Not authored, or empty: none.", since=4,
     ),
     _text("provenance:source", "source", "Source", "The photo or file that the parameters come from."),
     _text("provenance:sourceSha256", "source_sha256", "Source SHA-256", "SHA-256 of the source file, hexadecimal."),
