@@ -25,8 +25,9 @@ from usdfab.neural.gbuffer import NUMBERS, PLACE, SIZE, VIEW, pixel_footprint
 from usdfab.neural.material_file import Weights
 from usdfab.neural.network import KINDS
 from usdfab.neural.render import Buffer, places_of, render, see
+from usdfab.neural.rendered_material import learned_material, reversed_material
 from usdfab.neural.simd import LANES, load, store
-from usdfab.neural.stage_scene import NeuralScene, build, learned_material, mip_levels, reversed_material
+from usdfab.neural.stage_scene import NeuralScene, build, mip_levels
 from usdfab.neural.surface_from_fabric import surface_from_fabric
 from usdfab.neural.surface_material import SurfaceMaterial
 from usdfab.tracer.render import pack_view

@@ -266,9 +266,10 @@ def _u3m_files(
         pictures += files.values()
         visuals.append(_visual(one, files))
     physics = Physics(thickness_mm=1e3 * baked[0].maps.thickness, construction=construction_of(fabric.weave))
+    table = as_table(replace(fabric, albedo_map="", neural_weights=""))
     document = Document(
         fabric.name, visuals[0], visuals[1], physics, _made(source),
-        description="Baked from fibers by usdfab.", custom={"usdfab": as_table(replace(fabric, albedo_map=""))},
+        description="Baked from fibers by usdfab.", custom={"usdfab": table},
     )  # fmt: skip
     return [*pictures, write_u3m(document, folder, overwrite=options.overwrite)]
 

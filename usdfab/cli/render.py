@@ -85,7 +85,8 @@ def run(
         Parameter(help="With --backend mitsuba: tiled (the default with llvm), or flattened: all fibers, close-ups."),
     ] = None,
     reflection_weights: Annotated[
-        Path | None, Parameter(help="With --backend neural: a file of usdfab train neural instead of the shipped one.")
+        Path | None,
+        Parameter(help="With --backend neural: a file of usdfab train neural instead of the shipped or fabrics' own."),
     ] = None,
     transmission_weights: Annotated[Path | None, Parameter(help="The same for light from behind the cloth.")] = None,
     strict: Annotated[
@@ -172,6 +173,7 @@ def run(
 
         files_of = {"reflection": reflection_weights, "transmission": transmission_weights}
         networks = load_networks(files_of, f"--backend {backend}")
+        own = reflection_weights is None and transmission_weights is None
     results, warnings, worn = [], [], None
     place = "local" if scheduler is None and workers is not None else scheduler
     idle = place is None or all(file.finished for file in files)
@@ -184,9 +186,9 @@ def run(
                     source(file), file, frame, device or "auto", threads, fibers or "auto"
                 )
             elif backend == "neural":
-                facts, said, worn_here = render_neural(source(file), file, frame, networks)
+                facts, said, worn_here = render_neural(source(file), file, frame, networks, own)
             elif backend == "auto":
-                facts, said, worn_here = render_auto(source(file), file, frame, networks)
+                facts, said, worn_here = render_auto(source(file), file, frame, networks, own)
             else:
                 facts, said, worn_here = render_frame(source(file), file, frame, remote)
             results.append(facts)

@@ -26,9 +26,12 @@ NEURAL_SAMPLES = 4
 
 
 def render_auto(
-    source: SceneSource, file: RenderFile, options: FrameOptions, networks: Mapping[str, Weights]
+    source: SceneSource, file: RenderFile, options: FrameOptions, networks: Mapping[str, Weights], own: bool = True
 ) -> tuple[Facts, list[str], str | None]:
-    """Render one picture. Returns what ``--json`` says of it, warnings, and the name of the fabric put on."""
+    """Render one picture. Returns what ``--json`` says of it, warnings, and the name of the fabric put on.
+
+    ``own``: fabrics that name a network of their own are drawn with it from afar.
+    """
     from usdfab.neural.far_look import far_share, matched_scene
     from usdfab.neural.render import render
     from usdfab.neural.stage_scene import build
@@ -50,7 +53,7 @@ def render_auto(
     region = resolve_region(options.region.pixels(*size) if options.region else None, *size)
     if options.region is not None:
         shot, work = start(camera, replace(settings, region=region))
-    ready = build(scene, networks, pictures, source.strict)
+    ready = build(scene, networks, pictures, source.strict, own)
     tracer = Tracer(scene, pictures, source.strict)
     threads = settings.threads or 1
     announce = nullcontext() if options.quiet else announce_compilation(say)

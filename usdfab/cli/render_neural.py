@@ -31,9 +31,12 @@ def load_networks(files: Mapping[str, Path | None], what: str = "--backend neura
 
 
 def render_neural(
-    source: SceneSource, file: RenderFile, options: FrameOptions, networks: Mapping[str, Weights]
+    source: SceneSource, file: RenderFile, options: FrameOptions, networks: Mapping[str, Weights], own: bool = True
 ) -> tuple[Facts, list[str], str | None]:
-    """Render one picture. Returns what ``--json`` says of it, warnings, and the name of the fabric put on."""
+    """Render one picture. Returns what ``--json`` says of it, warnings, and the name of the fabric put on.
+
+    ``own``: fabrics that name a network of their own are drawn with it.
+    """
     from usdfab.neural.render import render
     from usdfab.neural.stage_scene import build
     from usdfab.tracer.compilation import announce_compilation
@@ -51,7 +54,7 @@ def render_neural(
     region = resolve_region(options.region.pixels(*size) if options.region else None, *size)
     if settings.spp < 1:
         raise UsdfabError(f"{settings.spp} samples are none", place="--spp", remedy="give 1 or more")
-    ready = build(scene, networks, pictures, source.strict)
+    ready = build(scene, networks, pictures, source.strict, own)
     announce = nullcontext() if options.quiet else announce_compilation(say)
     with announce, progress_bar(options.label, quiet=options.quiet) as update:
         done = render(ready, camera, size, region, settings.spp, settings.threads or 1, update)

@@ -15,6 +15,7 @@ Usage examples:
 
     usdfab train fit-network fabrics -o network.safetensors
     usdfab train neural surfaces -o material.safetensors --kind reflection
+    usdfab train neural --asset fabric.usda
 """
 
 run = App(name="train", help=HELP, help_format="markdown")

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from usdfab.cli.options import Json, Output, Overwrite, Quiet, Seed, print_json, progress_bar, say
+from usdfab.cli.options import Json, OptionalOutput, Overwrite, Quiet, Seed, print_json, progress_bar, say
 from usdfab.errors import UsdfabError
 
 
@@ -29,10 +29,19 @@ class NeuralOptions:
 
 
 def neural(
-    dataset: Path,
+    dataset: Path | None = None,
     /,
     *,
-    output: Output,
+    output: OptionalOutput = None,
+    asset: Annotated[
+        Path | None, Parameter(help="A fabric file: fine-tune the shipped networks to its fibers, in minutes.")
+    ] = None,
+    quality: Annotated[
+        Literal["draft", "standard", "high"], Parameter(help="With --asset: how many queries, paths and epochs.")
+    ] = "standard",
+    queries: Annotated[
+        int | None, Parameter(help="With --asset: footprints of each side of the cloth, 16 lights each.")
+    ] = None,
     architecture: Annotated[
         Literal["lean", "paper", "both"], Parameter(help="lean, paper (Chen et al. 2024), or a file of each.")
     ] = "lean",
@@ -52,6 +61,7 @@ def neural(
     resume: Annotated[bool, Parameter(negative="", help="Go on from the state that an interrupted run left.")] = False,
     device: Annotated[str, Parameter(help="cpu or cuda.")] = "cpu",
     seed: Seed = 0,
+    threads: Annotated[int | None, Parameter(help="With --asset: threads to trace with; all by default.")] = None,
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
@@ -62,17 +72,47 @@ def neural(
     tenth of the materials and some weaves are held out; the errors on them are told and kept in the file. The state is
     saved after each epoch, and the same seed gives the same weights, in one run or in several.
 
+    With --asset the material of one fabric: the shipped networks are fine-tuned to what its own fibers answer, path
+    traced, all orders of scattering, for both sides and light from either. The file (FABRIC.neural.safetensors by
+    default) is named in the fabric's file and used by the neural backend as long as the fabric stays the same.
+    Interrupted it keeps what was learned, and --resume goes on.
+
     Usage examples:
 
         usdfab train neural surfaces -o material.safetensors --epochs 60 --curves curves
         usdfab train neural surfaces -o material.safetensors --architecture both --kind both
         usdfab train neural surfaces -o material.safetensors --epochs 60 --resume
+        usdfab train neural --asset fabric.usda
 
     Parameters
     ----------
     dataset:
-        A folder of ``usdfab dataset neural``.
+        A folder of ``usdfab dataset neural``; left out with --asset.
     """
+    if (dataset is None) == (asset is None):
+        raise UsdfabError("a data set or --asset is needed, one of them", remedy="usdfab train neural --asset FABRIC")
+    if asset is not None:
+        for name, given in (
+            ("--architecture", architecture != "lean"), ("--kind", kind != "reflection"), ("--curves", curves),
+            ("--initial", initial), ("--learning-rate", learning_rate), ("--device", device != "cpu"),
+            ("--optimizer", optimizer != "adam"), ("--hold-out-weaves", hold_out_weaves != 1),
+            ("--epochs", epochs != 40), ("--batch", batch != 4096),
+        ):  # fmt: skip
+            if given:
+                raise UsdfabError("does not go with --asset", place=name, remedy="use --quality")
+        from usdfab.cli.train_asset import AssetOptions, train_fabric
+
+        shipped: dict[str, Path | None] = {"reflection": None, "transmission": None}
+        train_fabric(
+            AssetOptions(asset, output, quality, queries, shipped, resume, threads, seed, overwrite, json, quiet)
+        )
+        return
+    for name, given in (("--quality", quality != "standard"), ("--queries", queries), ("--threads", threads)):
+        if given:
+            raise UsdfabError("is for --asset", place=name)
+    if output is None:
+        raise UsdfabError("a file to write is needed", place="--output", remedy="usdfab train neural DATASET -o FILE")
+    assert dataset is not None
     from usdfab.files import checked_output
     from usdfab.neural.extra import require_neural_extra
 

@@ -116,6 +116,8 @@ class FabricParameters:
     albedo_map:
         Path of an image that multiplies the fiber albedo, looked up with the texture coordinates of the cloth; empty
         for none.
+    neural_weights:
+        Path of the file of ``usdfab train neural --asset`` with the fabric's own network; empty for none.
     """
 
     weave: Weave = field(default_factory=plain)
@@ -127,6 +129,7 @@ class FabricParameters:
     provenance: Provenance = field(default_factory=Provenance)
     variants: int = 4
     albedo_map: str = ""
+    neural_weights: str = ""
 
     def __post_init__(self) -> None:
         if len(self.size) != 2:
@@ -332,6 +335,7 @@ def as_table(fabric: FabricParameters) -> dict[str, Any]:
         "seed": fabric.seed,
         "variants": fabric.variants,
         "albedo_map": fabric.albedo_map,
+        "neural_weights": fabric.neural_weights,
         "warp": yarn(fabric.warp),
         "weft": yarn(fabric.weft),
         "provenance": {

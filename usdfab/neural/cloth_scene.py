@@ -12,13 +12,12 @@ from usdfab.tracer.world import FIRST_PATCH, UV_SCALE, World
 from usdfab.usd.scene import Material, Scene
 
 
-def pack_cloth(scene: Scene, world: World, mips: NDArray[np.int32]) -> Cloth:
-    """What the kernels read besides the world; ``mips`` as in ``gbuffer.Cloth``."""
+def pack_cloth(repeats: NDArray[np.float64], scene: Scene, world: World, mips: NDArray[np.int32]) -> Cloth:
+    """What the kernels read besides the world; ``repeats`` (fabrics, 2) metres and ``mips`` as in ``gbuffer.Cloth``."""
     macro = world.macro
     own = macro.fabrics[macro.material]
     woven = own[:, FIRST_PATCH] >= 0.0
     fabric = np.where(woven, own[:, FIRST_PATCH], 0).astype(np.int32)
-    repeats = repeats_of(scene)
     records = np.zeros((len(fabric), RECORD), dtype=np.float32)
     records[:, CORNER:NORMAL] = macro.corners[0].reshape(len(fabric), NORMAL)
     records[:, NORMAL:TILE_UV] = macro.faces[0]
@@ -37,15 +36,6 @@ def pack_cloth(scene: Scene, world: World, mips: NDArray[np.int32]) -> Cloth:
 def has_bodies(world: World) -> bool:
     """Whether any light has an extent, so that a ray can meet it."""
     return bool((~np.isin(world.lights.table[:, 0], (POINT, DISTANT, DOME))).any())
-
-
-def repeats_of(scene: Scene) -> NDArray[np.float64]:
-    """Width and height in metres of a repeat of each fabric's weave (fabrics, 2); one row if there is none."""
-    repeats = np.ones((max(len(scene.fabrics), 1), 2))
-    for row, surface in zip(repeats, scene.fabrics, strict=False):
-        fabric = surface.fabric
-        row[:] = fabric.cell[0] * fabric.weave.ends, fabric.cell[1] * fabric.weave.picks
-    return repeats
 
 
 def tile_coordinates(

@@ -81,7 +81,7 @@ def far_share(ready: NeuralScene, scene: Scene, camera: Camera, size: tuple[int,
     By the side of its footprint in yarns: none up to ``NEAR``, all from ``FAR`` on, smooth over the logarithm between.
     Pixels that do not see cloth in their middle have none, nor do their neighbours: edges are the tracer's.
     """
-    yarns = np.array([max(s.fabric.weave.ends, s.fabric.weave.picks) for s in scene.fabrics] or [1])
+    yarns = ready.crossings.max(axis=1) if len(ready.crossings) else np.ones(1)
     kind, fabric, side = _seen(ready, camera, size, region)
     level = np.log(np.maximum(side * yarns[fabric], 1e-9) / NEAR) / math.log(FAR / NEAR)
     t = np.clip(level, 0.0, 1.0)

@@ -287,16 +287,17 @@ def sort_pixels(group, starts, order):
 
 
 @njit(**OPTIONS)
-def add_answers(order, first, last, answers, albedo, weights, numbers, count, radiance):
+def add_answers(order, first, last, answers, albedo, tinted, weights, numbers, count, radiance):
     """Turn answers (N, 4), row k of pixel ``order[k]``, to light: ``albedo`` (4, 3) of one material, times weights.
 
-    A print colours what goes through fibers, not what they mirror.
+    A print colours what goes through fibers, not what they mirror: ``tinted`` (4,) is 1 for the former, else 0.
     """
     for k in range(first, last):
         p = order[k]
-        warp, weft, shine_warp, shine_weft = answers[k, 0], answers[k, 1], answers[k, 2], answers[k, 3]
         for c in range(3):
-            diffuse = warp * albedo[0, c] + weft * albedo[1, c]
-            shine = shine_warp * albedo[2, c] + shine_weft * albedo[3, c]
+            tint = numbers[(TINT + c) * count + p] - np.float32(1.0)
+            value = np.float32(0.0)
+            for j in range(4):
+                value += answers[k, j] * albedo[j, c] * (np.float32(1.0) + tinted[j] * tint)
             at = c * count + p
-            radiance[at] += weights[at] * (numbers[(TINT + c) * count + p] * diffuse + shine)
+            radiance[at] += weights[at] * value

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, edited
-from usdfab.neural.cloth_scene import repeats_of
 from usdfab.neural.material_file import Weights
 from usdfab.neural.render import Buffer, NeuralRender, places_of, render
 from usdfab.neural.stage_scene import NeuralScene, build, dressed, relit
@@ -69,8 +68,8 @@ class LiveScene:
         together = {**self.settings, **settings}
         fabrics = tuple(replace(surface, fabric=edited(surface.fabric, together)) for surface in self.first.fabrics)
         scene = replace(self.scene, fabrics=fabrics)
-        self.ready = dressed(self.ready, scene, self.networks)
-        if not np.array_equal(repeats_of(self.scene), repeats_of(scene)):
+        before, self.ready = self.ready, dressed(self.ready, scene, self.networks)
+        if not np.array_equal(before.cloth.repeats, self.ready.cloth.repeats):
             self._seen = ((), Buffer())  # footprints and places count in repeats
         self.scene, self.settings = scene, together
 

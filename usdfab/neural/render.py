@@ -127,8 +127,9 @@ def shade_strip(
         )  # fmt: skip
         if scene.decoders is not None:
             asked += answer_strip(
-                scene.decoders, scene.albedo, count, numbers, group, queries, weights, starts, order, answers, radiance
-            )
+                scene.decoders, scene.albedo, scene.tinted, count, numbers, group, queries, weights, starts, order,
+                answers, radiance,
+            )  # fmt: skip
         else:
             sort_pixels(group, starts, order)
             for number in np.flatnonzero(np.diff(starts)):
@@ -136,7 +137,8 @@ def shade_strip(
                 those = queries.reshape(QUERY, count)[:, order[first:last]].T
                 answers[first:last] = scene.plans[number].decode(those)
                 albedo = scene.albedo[number // 4, number % 2]
-                add_answers(order, first, last, answers, albedo, weights, numbers, count, radiance)
+                tinted = scene.tinted[number // 4]
+                add_answers(order, first, last, answers, albedo, tinted, weights, numbers, count, radiance)
             asked += int(starts[-1])
     return radiance, asked
 

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
+from usdfab.neural.asset_file import fabric_digest, load_asset_network
+from usdfab.neural.asset_network import TINTED, AssetMaterial
 from usdfab.neural.cloth_scene import has_bodies, pack_cloth
 from usdfab.neural.decoder import Plan, pack_plans, plans_of
 from usdfab.neural.gbuffer import Cloth
 from usdfab.neural.material_file import Weights
+from usdfab.neural.network import KINDS
+from usdfab.neural.rendered_material import learned_material, reversed_material
 from usdfab.neural.strips import Decoders
 from usdfab.neural.surface_from_fabric import surface_from_fabric
-from usdfab.neural.surface_material import PAPER_GAP, SurfaceMaterial
+from usdfab.neural.surface_material import SurfaceMaterial
 from usdfab.tracer import embree
 from usdfab.tracer.embree import EmbreeScene
 from usdfab.tracer.intrinsics import filter_address
@@ -29,8 +32,6 @@ from usdfab.usd.scene import DistantLight, DomeLight, Light, PointLight, Scene, 
 
 LARGEST_REPEAT = 16
 """Most ends or picks in a tile: beyond, a yarn is less than four pixels wide in what the encoder sees."""
-
-LARGEST_TWIST = math.radians(30.0)
 
 DOME_PLACES, AREA_PLACES = 16, 4
 """Directions of a dome, places on a light with an extent: of each sample."""
@@ -53,12 +54,19 @@ class NeuralScene:
 
     Parameters
     ----------
-    materials: 2 to each fabric
+    materials: 2 to each fabric without a network of its own
         Front and back, as the networks know them.
     plans: 4 to each fabric
         Front lit from the front, from behind; back lit from its own front, from behind.
     albedo: (fabrics, 2, 4, 3)
-        Of C_warp, C_weft, S_warp, S_weft, for light from the front and from behind.
+        Of C_warp, C_weft, S_warp, S_weft, for light from the front and from behind; of a fabric with a network of its
+        own: what makes its columns colours (``AssetMaterial.albedo``).
+    tinted: (fabrics, 4)
+        Which of an answer's four numbers are of light that a print colours: 1, else 0.
+    crossings: (fabrics, 2)
+        Ends and picks of what queries call one tile.
+    assets:
+        Networks of fabrics' own, by the fabrics' numbers.
     decoders:
         The plans for the compiled driver; None: ``plans`` are asked one by one.
     cloth:
@@ -72,30 +80,19 @@ class NeuralScene:
     plans: list[Plan]
     decoders: Decoders | None
     albedo: NDArray[np.float32]
+    tinted: NDArray[np.float32]
+    crossings: NDArray[np.int64]
+    assets: Mapping[int, AssetMaterial]
     cloth: Cloth
     lights: list[PlacedLight]
     embree: EmbreeScene
     warnings: tuple[str, ...]
 
 
-def reversed_material(material: SurfaceMaterial) -> SurfaceMaterial:
-    """The cloth turned about its warp: what was below is on top, left is right; a twist stays what it is."""
-    return replace(material, weave=~material.weave[:, ::-1])
-
-
-def learned_material(material: SurfaceMaterial) -> tuple[SurfaceMaterial, float]:
-    """A material among those that networks are trained on, and by how much more of the cloth its yarns should cover.
-
-    Networks know one gap and twists up to 30 degrees (Table 2 of Chen et al. 2024).
-    """
-    twist = tuple(float(np.clip(t, -LARGEST_TWIST, LARGEST_TWIST)) for t in material.twist)
-    known = replace(material, twist=(twist[0], twist[1]), gap=PAPER_GAP)
-    return known, (1.0 - material.gap) / (1.0 - PAPER_GAP)
-
-
 def build(
-    scene: Scene, networks: Mapping[str, Weights], pictures: Mapping[str, NDArray], strict: bool = False
-) -> NeuralScene:
+    scene: Scene, networks: Mapping[str, Weights], pictures: Mapping[str, NDArray], strict: bool = False,
+    own: bool = True,
+) -> NeuralScene:  # fmt: skip
     """A scene made ready.
 
     Parameters
@@ -106,11 +103,14 @@ def build(
         Of dome lights, by path.
     strict:
         Whether what cannot be drawn is an error; else it is one of ``warnings``.
+    own:
+        Whether fabrics that have networks of their own (``FabricParameters.neural_weights``) are drawn with them.
 
     Raises
     ------
     UsdfabError
-        If there is nothing to see or no light, a cloth has no uv, or a weave is larger than the encoder takes.
+        If there is nothing to see or no light, a cloth has no uv, a weave is larger than the encoder takes, or
+        a fabric's own network cannot be read.
     """
     if not scene.lights:
         raise UsdfabError("the stage has no light", place=scene.path, remedy="add a UsdLux light, e.g. a DomeLight")
@@ -125,12 +125,41 @@ def build(
         if material.fabric < 0 and (np.any(material.emissive) or "emissiveColor" in material.textures):
             left_out("a surface that glows lights nothing in the neural backend", material.path)
     _check_uv(scene)
-    materials, albedo = materials_of(scene)
-    return _assemble(scene, materials, asked_plans(materials, networks), albedo, [*warnings], pictures, strict)
+    assets = asset_networks(scene, left_out) if own else {}
+    return _assemble(scene, _dress(scene, assets), networks, [*warnings], pictures, strict)
 
 
-def materials_of(scene: Scene) -> tuple[list[SurfaceMaterial], NDArray[np.float32]]:
-    """Front and back of a scene's fabrics as the networks know them, and ``albedo`` of ``NeuralScene``.
+@dataclass(frozen=True, eq=False)
+class _Dress:
+    """What fabrics look like: fields of ``NeuralScene``, ``materials`` only of those without a network of their own."""
+
+    materials: list[SurfaceMaterial]
+    albedo: NDArray[np.float32]
+    tinted: NDArray[np.float32]
+    crossings: NDArray[np.int64]
+    assets: Mapping[int, AssetMaterial]
+
+    def plans(self, networks: Mapping[str, Weights]) -> list[Plan]:
+        """``plans`` of ``NeuralScene``; the encoders run here."""
+        both = [plans_of(networks[k].network, self.materials) for k in KINDS] if self.materials else [[], []]
+        shared = iter([both[kind][k] for k in range(len(self.materials)) for kind in range(len(KINDS))])
+        return [
+            plan
+            for number in range(len(self.albedo))
+            for plan in (
+                self.assets[number].plans() if number in self.assets else [next(shared) for _ in range(2 * len(KINDS))]
+            )
+        ]
+
+    def tiles(self, scene: Scene) -> NDArray[np.float64]:
+        """Width and height in metres (fabrics, 2) of what queries call one tile; one row if there is no fabric."""
+        if not scene.fabrics:
+            return np.ones((1, 2))
+        return np.array([surface.fabric.cell for surface in scene.fabrics]) * self.crossings
+
+
+def _dress(scene: Scene, assets: Mapping[int, AssetMaterial]) -> _Dress:
+    """Fabrics as the networks know them.
 
     Raises
     ------
@@ -139,7 +168,13 @@ def materials_of(scene: Scene) -> tuple[list[SurfaceMaterial], NDArray[np.float3
     """
     materials: list[SurfaceMaterial] = []
     albedo = np.zeros((len(scene.fabrics), 2, 4, 3))
+    tinted = np.tile([1.0, 1.0, 0.0, 0.0], (len(scene.fabrics), 1))
+    crossings = np.ones((len(scene.fabrics), 2), dtype=np.int64)
     for number, surface in enumerate(scene.fabrics):
+        if number in assets:
+            albedo[number], tinted[number], crossings[number] = assets[number].albedo, TINTED, assets[number].tile
+            continue
+        crossings[number] = surface.fabric.weave.ends, surface.fabric.weave.picks
         cloth, colors = surface_from_fabric(surface.fabric)
         cloth, cover = learned_material(cloth)
         if max(cloth.rows, cloth.columns) > LARGEST_REPEAT:
@@ -149,24 +184,22 @@ def materials_of(scene: Scene) -> tuple[list[SurfaceMaterial], NDArray[np.float3
             )  # fmt: skip
         materials += [cloth, reversed_material(cloth)]
         albedo[number] = cover * np.stack([colors.reflection, colors.transmission])
-    return materials, albedo.astype(np.float32)
-
-
-def asked_plans(materials: Sequence[SurfaceMaterial], networks: Mapping[str, Weights]) -> list[Plan]:
-    """``plans`` of ``NeuralScene``; the encoders run here."""
-    if not materials:
-        return []
-    both = [plans_of(networks[kind].network, materials) for kind in ("reflection", "transmission")]
-    return [both[kind][k] for k in range(len(materials)) for kind in (0, 1)]
+    return _Dress(materials, albedo.astype(np.float32), tinted.astype(np.float32), crossings, assets)
 
 
 def dressed(ready: NeuralScene, scene: Scene, networks: Mapping[str, Weights]) -> NeuralScene:
-    """A scene with its fabrics changed: their yarns, colours and weaves, nothing else. Takes milliseconds."""
-    materials, albedo = materials_of(scene)
-    if [_identity(m) for m in materials] != [_identity(m) for m in ready.materials]:
-        plans = asked_plans(materials, networks)
-        ready = replace(ready, materials=materials, plans=plans, decoders=pack_plans(plans))
-    return replace(ready, albedo=albedo, cloth=pack_cloth(scene, ready.world, ready.cloth.mips))
+    """A scene with its fabrics changed: their yarns, colours and weaves, nothing else. Takes milliseconds.
+
+    A fabric's own network does not know the fabric changed: then the shared networks show it.
+    """
+    assets = {k: asset for k, asset in ready.assets.items() if asset.digest == fabric_digest(scene.fabrics[k].fabric)}
+    dress = _dress(scene, assets)
+    known = ([_identity(m) for m in ready.materials], set(ready.assets))
+    if ([_identity(m) for m in dress.materials], set(assets)) != known:
+        plans = dress.plans(networks)
+        ready = replace(ready, plans=plans, decoders=pack_plans(plans))
+    cloth = pack_cloth(dress.tiles(scene), scene, ready.world, ready.cloth.mips)
+    return replace(ready, cloth=cloth, **vars(dress))
 
 
 def relit(ready: NeuralScene, scene: Scene, pictures: Mapping[str, NDArray]) -> NeuralScene:
@@ -184,6 +217,21 @@ def _identity(material: SurfaceMaterial) -> tuple:
     )  # fmt: skip
 
 
+def asset_networks(scene: Scene, left_out: Callable[[str, str], None]) -> dict[int, AssetMaterial]:
+    """The networks of fabrics' own, by the fabrics' numbers; ``left_out`` is told (problem, place) of stale ones."""
+    found: dict[int, AssetMaterial] = {}
+    for number, surface in enumerate(scene.fabrics):
+        file = surface.fabric.neural_weights
+        if not file:
+            continue
+        material = load_asset_network(file, surface.fabric)
+        if material is None:
+            left_out(f"the fabric is not what {file} was trained on, which is not used", surface.path)
+        else:
+            found[number] = material
+    return found
+
+
 def _check_uv(scene: Scene) -> None:
     worn = {k for k, material in enumerate(scene.materials) if material.fabric >= 0}
     for mesh in scene.meshes:
@@ -194,8 +242,8 @@ def _check_uv(scene: Scene) -> None:
 
 
 def _assemble(
-    scene: Scene, materials: list[SurfaceMaterial], plans: list[Plan], albedo: NDArray[np.float32],
-    warnings: list[str], pictures: Mapping[str, NDArray], strict: bool,
+    scene: Scene, dress: _Dress, networks: Mapping[str, Weights], warnings: list[str],
+    pictures: Mapping[str, NDArray], strict: bool,
 ) -> NeuralScene:  # fmt: skip
     maps = [surface.albedo_map for surface in scene.fabrics]
     wanted = [t for m in scene.materials if m.fabric < 0 for t in m.textures.values()] + [m for m in maps if m]
@@ -219,9 +267,11 @@ def _assemble(
         macro, pack_patches([]), rows, pack_textures(used, images), pack_lights(scene, dict(pictures)),
         addresses,  # type: ignore[arg-type]
     )  # fmt: skip
+    plans = dress.plans(networks)
     return NeuralScene(
-        world, materials, plans, pack_plans(plans), albedo, pack_cloth(scene, world, mips),
-        _placed(scene, pictures), embree_scene, (*warnings, *said, *more),
+        world=world, plans=plans, decoders=pack_plans(plans), **vars(dress),
+        cloth=pack_cloth(dress.tiles(scene), scene, world, mips), lights=_placed(scene, pictures),
+        embree=embree_scene, warnings=(*warnings, *said, *more),
     )  # fmt: skip
 
 

@@ -73,14 +73,17 @@ def decode_group(decoders, number, queries, stride, order, first, last, out):
 
 
 @njit(**OPTIONS)
-def answer_strip(decoders, albedo, count, numbers, group, queries, weights, starts, order, answers, radiance):
+def answer_strip(decoders, albedo, tinted, count, numbers, group, queries, weights, starts, order, answers, radiance):
     """Ask the decoders what ``light_pixels`` prepared, and add the light; returns how many queries there were."""
     sort_pixels(group, starts, order)
     for number in range(len(starts) - 1):
         first, last = starts[number], starts[number + 1]
         if last > first:
             decode_group(decoders, number, queries, count, order, first, last, answers)
-            add_answers(order, first, last, answers, albedo[number // 4, number % 2], weights, numbers, count, radiance)
+            add_answers(
+                order, first, last, answers, albedo[number // 4, number % 2], tinted[number // 4], weights, numbers,
+                count, radiance,
+            )  # fmt: skip
     return starts[-1]
 
 

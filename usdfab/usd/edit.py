@@ -43,6 +43,9 @@ from usdfab.usd.fabric_io import (
 from usdfab.usd.schema_source import FABRIC_ATTRIBUTES, YARN_ATTRIBUTES, fabric_attribute_name, yarn_attribute_name
 from usdfab.usd.stage import open_stage, readable, site, stage_name
 
+_FILES = ("albedo_map", "neural_weights")
+"""Fields that are paths: they read otherwise from another folder."""
+
 Change = Callable[[FabricParameters], FabricParameters]
 
 
@@ -160,8 +163,12 @@ def _author(
     path = prim.GetPath()
     variant = variant_path(path, colorway) if colorway else path
     meters = meters_per_uv_from_prim(prim)
-    if after.albedo_map != before.albedo_map:
-        after = replace(after, albedo_map=relative_path(after.albedo_map, out.parent))
+    moved: dict[str, Any] = {
+        name: relative_path(getattr(after, name), out.parent)
+        for name in _FILES
+        if getattr(after, name) != getattr(before, name)
+    }
+    after = replace(after, **moved)
     old, values = fabric_values(before, meters), fabric_values(after, meters)
     check_texts(values)
     items: list[tuple[str, Any, Any, Any]] = [
@@ -224,7 +231,8 @@ def _check_effect(file: Path, prim: Usd.Prim, expected: FabricParameters, name: 
     """``UsdfabError`` if the fabric that is read from ``file`` is not the expected one."""
     stage = Usd.Stage.Open(str(file))  # kept in a name: prims do not keep their stage alive
     written = fabric_from_prim(find_fabric(stage, prim.GetPath()))
-    if replace(written, albedo_map="") != replace(expected, albedo_map=""):
+    unseen: dict[str, Any] = dict.fromkeys(_FILES, "")
+    if replace(written, **unseen) != replace(expected, **unseen):
         layers = {spec.layer.realPath for spec in prim.GetPrimStack()} - {prim.GetStage().GetRootLayer().realPath}
         where = f" ({', '.join(sorted(Path(p).name for p in layers if p))})" if layers else ""
         raise UsdfabError(

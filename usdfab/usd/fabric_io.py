@@ -55,11 +55,19 @@ def write_fabric(
         If the file exists (unless ``overwrite``), cannot be written, or a text in the fabric cannot be stored.
     """
     checked_output(path, overwrite=overwrite)
-    fabric = replace(fabric, albedo_map=relative_path(fabric.albedo_map, Path(path).parent))
+    fabric = with_relative_files(fabric, Path(path).parent)
     stage = new_stage()
     stage.SetDefaultPrim(UsdGeom.Scope.Define(stage, LOOKS_PATH).GetPrim())
     define_fabric_material(stage, FABRIC_PATH, fabric, meters_per_uv=meters_per_uv)
     return export_layer(stage.GetRootLayer(), path, overwrite=overwrite)
+
+
+def with_relative_files(fabric: FabricParameters, folder: Path) -> FabricParameters:
+    """The fabric with the files that it names as seen from ``folder``."""
+    return replace(
+        fabric, albedo_map=relative_path(fabric.albedo_map, folder),
+        neural_weights=relative_path(fabric.neural_weights, folder),
+    )  # fmt: skip
 
 
 def relative_path(file: str, folder: Path) -> str:
@@ -78,9 +86,7 @@ def define_fabric_material(
 ) -> UsdShade.Material:
     """Define a Material at ``path`` that carries ``fabric``; every attribute is authored, also at its default.
 
-    The albedo map is authored only where there is one.
-
-    A relative ``albedo_map`` is authored as it is: relative to the layer.
+    Files are authored only where there are any, relative ones as they are: relative to the layer.
 
     Authors both API schemas with all attributes, and ``outputs:surface`` connected to a UsdPreviewSurface called
     ``Preview`` (``preview_color``, ``preview_roughness``).
@@ -130,6 +136,7 @@ def fabric_values(fabric: FabricParameters, meters_per_uv: float) -> dict[str, A
         "variants": fabric.variants,
         "metersPerUv": meters_per_uv,
         "albedoMap": fabric.albedo_map,
+        "neural:weights": fabric.neural_weights,
     }
 
 
@@ -296,6 +303,7 @@ def fabric_from_prim(prim: Usd.Prim) -> FabricParameters:
         return FabricParameters(
             weave, values["sampleSize"], yarns["warp"], yarns["weft"], values["seed"], values["name"],
             Provenance(**provenance), values["variants"], values["albedoMap"],
+            values["neural:weights"],
         )  # fmt: skip
 
 

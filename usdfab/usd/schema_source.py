@@ -148,6 +148,11 @@ FABRIC_ATTRIBUTES: tuple[SchemaAttribute, ...] = (
         "them. OpenEXR and Radiance files are linear Rec. 709, others sRGB. Not authored, or empty: none. The primvar "
         "usdfab:albedo of a mesh multiplies the albedo likewise.", since=2,
     ),
+    SchemaAttribute(
+        "neural:weights", "neural_weights", "asset", "", "@@", "Neural weights", "Fabric",
+        "File of `usdfab train neural --asset` with a network of this fabric's own, for the neural backend. It is used "
+        "only as long as the fabric is the one that it was trained on. Not authored, or empty: none.", since=4,
+    ),
     _text("provenance:source", "source", "Source", "The photo or file that the parameters come from."),
     _text("provenance:sourceSha256", "source_sha256", "Source SHA-256", "SHA-256 of the source file, hexadecimal."),
     _text("provenance:generator", "generator", "Generator", "Program and version that wrote the parameters."),

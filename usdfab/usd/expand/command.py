@@ -34,10 +34,11 @@ from usdfab.usd.expand.curves import FiberCurves, tile_curves
 from usdfab.usd.expand.divide import divide
 from usdfab.usd.expand.frames import MAX_SHEAR, Frames, poses
 from usdfab.usd.expand.instances import Cloth, Written, write_instancer, write_xforms
-from usdfab.usd.expand.layer import editable, new_layer, relative_path, replace_mesh
+from usdfab.usd.expand.layer import editable, new_layer, replace_mesh
 from usdfab.usd.expand.place import Box, Pieces, Tint, place_pieces
 from usdfab.usd.expand.seams import Seams, measure_seams
 from usdfab.usd.expand.surface import ClothSurface
+from usdfab.usd.fabric_io import with_relative_files
 from usdfab.usd.read_scene import read_scene, time_code
 from usdfab.usd.scene import FabricSurface, Mesh, Scene, Texture
 from usdfab.usd.stage import site, stage_name
@@ -383,8 +384,8 @@ class _Writer:
         purpose = self.options.purpose
         root = define_root(self.stage, prim, centre, self.meters, self.time, purpose)
         fabric = surface.fabric
-        if self.override and fabric.albedo_map:
-            fabric = replace(fabric, albedo_map=relative_path(fabric.albedo_map, self.folder))
+        if self.override:
+            fabric = with_relative_files(fabric, self.folder)
         material = fabric_material(self.stage, root, replace(surface, fabric=fabric), new=self.override)
         if not material:
             self.warnings.append(f"{site(self.stage, Sdf.Path(mesh.path))}: no material is bound to the curves")
