@@ -1,12 +1,15 @@
-"""The neural material's speed: answers a second, against the surface model at equal error, and frames a second.
+"""The neural material's speed: answers, frames and their parts, and the surface model at equal error. One JSON line.
 
     python tests/benchmarks/bench_neural.py [--smoke] [--threads N] [--stage samples/drape.usda] [--fabric F]
         [--reflection-weights W] [--transmission-weights W]
 
+Times are of the processor (all threads together), so that other programs on the machine count little; frames a second
+are also given by the clock. ``cores``: frames a second if all threads had a core of their own.
+
 Equal error: for each of some materials of Table 2 (Chen et al. 2024) that no data set holds, the mean absolute error of
-the network against the surface model with many samples; then the fewest samples with which the surface model itself is
-as near, and how long both take for the same queries on one thread, in the same run. Footprints are of both halves of
-Table 2. ``paper`` is the paper's decoder, untrained: its speed only. One line of JSON per part.
+the network against the surface model with many samples; then the fewest samples (a power of two) with which the surface
+model itself is as near, and how long both take for the same queries, in the same run. Footprints are of both halves of
+Table 2. ``paper`` is the paper's decoder, untrained: its speed only.
 """
 
 from __future__ import annotations
@@ -27,43 +30,40 @@ UNKNOWN_SEED = 4711
 """Of the materials: data sets are made with small seeds."""
 
 
-def best_of(runs: int, call: Callable[[], object]) -> float:
+def best_of(runs: int, call: Callable[[], object], clock: Callable[[], float] = time.process_time) -> float:
     """Seconds of the fastest of some calls, after one that compiles."""
     call()
     seconds = []
     for _ in range(runs):
-        start = time.perf_counter()
+        start = clock()
         call()
-        seconds.append(time.perf_counter() - start)
+        seconds.append(clock() - start)
     return min(seconds)
 
 
-def tell(part: str, **row: object) -> None:
-    """One line of JSON."""
-    print(json.dumps({"bench": "neural", "part": part, **row, "load": os.getloadavg()[0]}), flush=True)
-
-
-def decoding(networks: dict, threads: int, smoke: bool) -> None:
-    """Answers a second of each decoder."""
+def decoding(networks: dict, smoke: bool) -> dict:
+    """Milliseconds per million answers of each decoder on one thread."""
     from usdfab.neural.dataset_draws import DatasetSettings, draw_material, draw_queries
     from usdfab.neural.decoder import plans_of
     from usdfab.neural.training import new_network
 
-    count = 2**14 if smoke else 2**20
+    count = 2**14 if smoke else 2**18
     settings = DatasetSettings(queries=count, seed=UNKNOWN_SEED)
     material, queries = draw_material(settings, 0), draw_queries(settings, 0, "reflection")
+    columns, order = np.asarray(queries, dtype=np.float32).T.ravel(), np.arange(count, dtype=np.int32)
+    out, found = np.empty((count, 4), dtype=np.float32), {}
     for name, network in (("lean", networks["reflection"].network), ("paper", new_network("paper", "reflection"))):
         plan = plans_of(network.eval(), [material])[0]
-        for used in sorted({1, threads}):
-            seconds = best_of(1 if smoke else 5, lambda plan=plan, used=used: plan.decode(queries, used))
-            tell(
-                "decoder", decoder=name, threads=used, multiplications=plan.multiplications,
-                millions_per_second=round(count / seconds / 1e6, 2),
-                fps_1280x720=round(count / seconds / (1280 * 720), 2), goal_fps=10,
-            )  # fmt: skip
+        seconds = best_of(1 if smoke else 7, lambda plan=plan: plan.decode_columns(columns, count, order, out))
+        found[name] = {
+            "multiplications": plan.multiplications, "ms_per_million": round(1e9 * seconds / count, 1),
+        }  # fmt: skip
+    encoder = networks["reflection"].network
+    found["encoder_ms"] = round(1e3 * best_of(1 if smoke else 5, lambda: plans_of(encoder, [material])), 2)
+    return found
 
 
-def equal_error(networks: dict, smoke: bool) -> None:
+def equal_error(networks: dict, smoke: bool) -> dict:
     """How many times faster than the surface model that is as near to the truth."""
     from usdfab.neural.aggregation import aggregate
     from usdfab.neural.dataset_draws import DatasetSettings, draw_material, draw_queries
@@ -71,6 +71,7 @@ def equal_error(networks: dict, smoke: bool) -> None:
 
     count, materials, truth = (200, 1, 256) if smoke else (4000, 7, 8192)
     settings = DatasetSettings(queries=count, seed=UNKNOWN_SEED)
+    told = {}
     for kind, weights in networks.items():
         ratios, needed, errors = [], [], []
         for index in range(materials):
@@ -93,16 +94,16 @@ def equal_error(networks: dict, smoke: bool) -> None:
             ratios.append(surface_time / network_time)
             needed.append(samples)
             errors.append(error / float(true.mean()))
-        tell(
-            "equal error", kind=kind, materials=materials, faster=round(statistics.median(ratios), 2),
-            faster_each=[round(r, 2) for r in ratios], samples=needed, error=[round(e, 4) for e in errors], goal=10,
-        )  # fmt: skip
+        told[kind] = {
+            "faster": round(statistics.median(ratios), 1), "faster_each": [round(r, 1) for r in ratios],
+            "samples": needed, "error": [round(e, 4) for e in errors],
+        }  # fmt: skip
+    return told
 
 
-def frames(networks: dict, arguments: argparse.Namespace, threads: int) -> None:
-    """Frames a second of a stage, and of cloth that fills the picture."""
+def frames(networks: dict, arguments: argparse.Namespace, threads: int) -> dict:
+    """Frames a second of cloth that fills the picture and of a stage, and where their time goes."""
     from usdfab.fabric import preset
-    from usdfab.neural.render import render
     from usdfab.neural.stage_scene import build
     from usdfab.usd.fabric_io import read_fabric
     from usdfab.usd.read_scene import read_scene
@@ -113,22 +114,38 @@ def frames(networks: dict, arguments: argparse.Namespace, threads: int) -> None:
     size = (64, 36) if arguments.smoke else (1280, 720)
     swatch = swatch_scene(cloth)
     sun = DistantLight("/Sun", np.array([0.3, 0.2, -0.93]), np.full(3, 3.0), 0.0)
+    other = DistantLight("/Other", np.array([-0.5, 0.2, -0.8]), np.full(3, 1.0), 0.0)
     camera = replace(swatch.cameras[0], tan_half=swatch.cameras[0].tan_half * np.array([1.0, 0.5625]))
-    worlds = {"cloth fills the picture, one light": (replace(swatch, lights=(sun,)), camera)}
-    if not arguments.smoke:
-        stage = read_scene(arguments.stage, fabric_override=cloth)
-        worlds["stage"] = (stage, stage.cameras[0])
-    for name, (scene, seen_by) in worlds.items():
-        ready = build(scene, networks, {})
-        seconds = best_of(
-            1 if arguments.smoke else 3,
-            lambda ready=ready, seen_by=seen_by: render(ready, seen_by, size, (0, 0, *size), 1, threads),
-        )
-        found = render(ready, seen_by, size, (0, 0, *size), 1, threads)
-        tell(
-            "frames", scene=name, width=size[0], height=size[1], threads=threads, fps=round(1.0 / seconds, 3),
-            answers_per_frame=found.decodes, goal_fps=10,
-        )  # fmt: skip
+    stage = read_scene(arguments.stage, fabric_override=cloth)
+    worlds = {
+        "filled_one_light": (replace(swatch, lights=(sun,)), camera),
+        "filled_two_lights": (replace(swatch, lights=(sun, other)), camera),
+        "stage_one_light": (replace(stage, lights=(sun,)), stage.cameras[0]),
+        "stage": (stage, stage.cameras[0]),
+    }
+    return {
+        name: _frame(build(scene, networks, {}), seen_by, size, threads, 1 if arguments.smoke else 5)
+        for name, (scene, seen_by) in worlds.items()
+    }
+
+
+def _frame(ready, camera, size: tuple[int, int], threads: int, runs: int) -> dict:  # type: ignore[no-untyped-def]
+    """One scene: milliseconds of the processor for a whole frame, for one whose pixels are known, for its parts."""
+    from usdfab.neural.render import Buffer, render
+
+    whole, kept = (ready, camera, size, (0, 0, *size), 1, threads), Buffer()
+    found = render(*whole, buffer=kept)
+    busy = best_of(runs, lambda: render(*whole))
+    again = best_of(runs, lambda: render(*whole, buffer=kept))
+    dark = replace(ready, lights=[])
+    seen = best_of(runs, lambda: render(dark, *whole[1:]))
+    wall = best_of(runs, lambda: render(*whole), time.perf_counter)
+    cores = min(threads, os.cpu_count() or 1)
+    return {
+        "answers": found.decodes, "ms": round(1e3 * busy, 1), "ms_camera_rays": round(1e3 * seen, 1),
+        "ms_light_and_answers": round(1e3 * again, 1), "fps_clock": round(1.0 / wall, 2),
+        "fps_cores": round(cores / busy, 2), "fps_cores_known_pixels": round(cores / again, 2),
+    }  # fmt: skip
 
 
 def main() -> None:
@@ -148,9 +165,12 @@ def main() -> None:
         {"reflection": arguments.reflection_weights, "transmission": arguments.transmission_weights}
     )
     threads = thread_count(arguments.threads)
-    decoding(networks, threads, arguments.smoke)
-    equal_error(networks, arguments.smoke)
-    frames(networks, arguments, threads)
+    told = {
+        "bench": "neural", "threads": threads, "decoder": decoding(networks, arguments.smoke),
+        "equal_error": equal_error(networks, arguments.smoke), "frames": frames(networks, arguments, threads),
+        "goals": {"fps": 10, "faster": 10}, "load": os.getloadavg()[0],
+    }  # fmt: skip
+    print(json.dumps(told), flush=True)
 
 
 if __name__ == "__main__":

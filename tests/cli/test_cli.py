@@ -63,6 +63,7 @@ def test_help_lists_every_command_and_shows_examples() -> None:
         "render",
         "merge",
         "inspect",
+        "view",
         "bind",
         "expand",
         "new",

@@ -118,3 +118,23 @@ def test_bad_weights_and_stages_end_in_one_line(run, tiny, tmp_path, weights):
     code, _, err = run("render", tmp_path / "large.usda", "-o", tmp_path / "a.exr", *SMALL, *weights)
     assert code == 2 and "larger than the encoder takes" in err and err.count("\n") == 1
     assert not (tmp_path / "a.exr").exists()
+
+
+def test_fibers_near_and_the_network_far(run, tiny, tmp_path, weights):
+    def draw(name: str, backend: str, *options: object) -> tuple[dict, np.ndarray]:
+        more = weights if backend != "embree" else ()
+        code, out, err = run(
+            "render", tiny, "-o", tmp_path / name, "--backend", backend, *more, "--json", "-q", *options
+        )
+        assert (code, err) == (0, "")
+        return json.loads(out), read_image(tmp_path / name).pixels
+
+    # The swatch is three millimetres wide, a yarn is 1.7 mm: at 32 pixels all are fibers, at 2 none is.
+    facts, near = draw("a.exr", "auto", "--resolution", 32, "--spp", 2)
+    assert facts["neural"] == 0 and facts["tiles_traced"] == facts["tiles"]
+    assert np.array_equal(near, draw("b.exr", "embree", "--resolution", 32, "--spp", 2)[1])
+    part, cut = draw("c.exr", "auto", "--resolution", 32, "--spp", 2, "--region", "5,3,30,20")
+    assert part["region"] == [5, 3, 30, 20] and np.array_equal(cut, near[3:20, 5:30])
+    facts, far = draw("d.exr", "auto", "--resolution", 1, "--spp", 2)
+    assert facts["neural"] == 1 and facts["tiles_traced"] == 0 and facts["decodes"] == 4
+    assert np.allclose(far, near.mean(axis=(0, 1)), rtol=0.3) and far.min() > 0

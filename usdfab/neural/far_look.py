@@ -21,7 +21,8 @@ from usdfab.usd.scene import Camera, Scene
 Floats = NDArray[np.float64]
 
 PIXELS, SAMPLES = 6144, 32
-"""Of the small traced picture by which colours are matched: a fabric's mean is then good to about 1 %."""
+"""Of the small traced picture by which colours are matched: a fabric's mean is then good to about 1 %. Smaller ones
+have more samples."""
 
 NEAR, FAR = 0.5, 1.0
 """Yarns per pixel up to which pixels show fibers alone, and from which on the neural cloth alone."""
@@ -40,10 +41,11 @@ def matched_scene(
     fitted to it by least squares, none below 0, with the mean of each fabric kept; what is hardly seen keeps its first
     guess. Good for this view, and for others of the same cloth in the same light.
     """
-    scale = math.sqrt(PIXELS / (size[0] * size[1]))
-    small = (max(round(size[0] * scale), 16), max(round(size[1] * scale), 16))
+    scale = min(math.sqrt(PIXELS / (size[0] * size[1])), 1.0)
+    small = (max(round(size[0] * scale), 1), max(round(size[1] * scale), 1))
     window = (0, 0, *small)
-    settings = RenderSettings(small, spp=SAMPLES, seed=seed, threads=threads)
+    spp = SAMPLES * max(PIXELS // (small[0] * small[1]), 1)
+    settings = RenderSettings(small, spp=spp, seed=seed, threads=threads)
     traced = tracer.render(camera, settings).pixels.astype(float)
     kind, fabric, _ = _seen(ready, camera, small, window)
     inner = _surrounded(kind == CLOTH)

@@ -39,7 +39,7 @@ class Orbit:
         now = math.asin(float(np.clip(back @ self.up, -1.0, 1.0)))
         wanted = float(np.clip(now + math.radians(elevation), -STEEPEST, STEEPEST))
         # A camera that starts beyond the limit, such as one straight above, is not thrown back to it.
-        rise = wanted - now if elevation and abs(wanted) <= abs(now + math.radians(elevation)) else 0.0
+        rise = wanted - now if (wanted - now) * elevation > 0.0 else 0.0
         turn = _rotation(self.up, math.radians(azimuth)) @ _rotation(side, -rise)
         moved = np.eye(4)
         moved[:3, :3] = turn @ self.to_world[:3, :3]
