@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from usdfab.imaging import flip, mse
 from usdfab.neural.aggregation import aggregate
 from usdfab.neural.decoder import plans_of
-from usdfab.neural.evaluation_scenes import Stage, stages, zoom_stages
+from usdfab.neural.evaluation_scenes import CELL, Stage, stages, zoom_stages
 from usdfab.neural.material_file import Weights
 from usdfab.neural.network import KINDS
 from usdfab.neural.render import render
@@ -174,7 +174,7 @@ def zoom_rows(
 
     ``neural``, ``surface_1``, ``truth``: root mean square over pixels of the deviation among ``SHIFTS`` such renders,
     over the mean of the picture. What is left of the truth's is the pattern itself that passes through pixels.
-    ``size``: median footprint in tiles.
+    ``tiles``: a pixel's width on the cloth where it is seen in the middle; ``mse``: of the network's picture.
     """
     rows, pictures = [], []
     for stage in zoom_stages(scale.zoom):
@@ -183,7 +183,9 @@ def zoom_rows(
             NEURAL: made, "surface_1": with_surface(made, stage, 1, scale.seed),
             "truth": with_surface(made, stage, TRUTH // SHIFTS, scale.seed + 1),
         }  # fmt: skip
-        row: dict[str, float] = {"distance": float(np.linalg.norm(stage.camera.to_world[:3, 3]))}
+        distance = float(np.linalg.norm(stage.camera.to_world[:3, 3]))
+        wide = CELL * stage.cloths[0].material.columns
+        row: dict[str, float] = {"tiles": float(2.0 * distance * stage.camera.tan_half[0] / scale.zoom_pixels / wide)}
         line = []
         for name, way in ways.items():
             frames = np.stack([
@@ -192,6 +194,7 @@ def zoom_rows(
             deviation = np.sqrt(frames.var(axis=0).mean())
             row[name] = float(deviation / max(frames.mean(), 1e-12))
             line.append(frames[0])
+        row["mse"] = mse(line[0], line[2])
         rows.append(row)
         pictures.append(line)
         progress()
@@ -232,9 +235,9 @@ def format_evaluation(result: Evaluation) -> str:
         lines.append(
             f"{r.scene:<26}{kind:<9}{r.method:<12}{r.samples:>8}{r.mse:>11.6f}{r.flip:>8.4f}{1e3 * r.seconds:>9.0f}"
         )
-    lines += [
-        "",
-        f"{'zoom: distance (m)':<20}{'neural':>9}{'surface 1':>11}{'truth':>9}   change within a pixel / mean",
-    ]
-    lines += [f"{z['distance']:<20.3f}{z[NEURAL]:>9.4f}{z['surface_1']:>11.4f}{z['truth']:>9.4f}" for z in result.zoom]
+    head = f"{'zoom: tiles a pixel':<20}{NEURAL:>9}{'surface 1':>11}{'truth':>9}{'MSE':>11}"
+    lines += ["", f"{head}   change within a pixel over the mean; MSE of the network"]
+    for z in result.zoom:
+        changes = f"{z[NEURAL]:>9.4f}{z['surface_1']:>11.4f}{z['truth']:>9.4f}"
+        lines.append(f"{z['tiles']:<20.3f}{changes}{z['mse']:>11.6f}")
     return "\n".join(lines)

@@ -104,7 +104,7 @@ def patch(surface: Surface, lengths: tuple[float, float], steps: tuple[int, int]
     return Mesh(f"/Patch{fabric}", points, triangles, normals[triangles], uv[triangles], faces, True)
 
 
-def camera_at(eye: Sequence[float], target: Sequence[float], half: float) -> Camera:
+def camera_at(eye: Sequence[float] | Floats, target: Sequence[float], half: float) -> Camera:
     """A camera at ``eye`` that looks at ``target``; ``half`` is the tangent of half its field of view."""
     place, aim = np.asarray(eye, dtype=float), np.asarray(target, dtype=float)
     back = (place - aim) / np.linalg.norm(place - aim)
@@ -199,6 +199,17 @@ def stages() -> list[Stage]:
 
 
 def zoom_stages(steps: int) -> list[Stage]:
-    """The single cloth of the unseen twill from ever farther away, up to 8 times."""
+    """A flat sheet of the unseen twill that fills the picture, from ever farther away, up to 64 times."""
     twill = Cloth(unseen_twill(), (0.5, 0.12, 0.1), (0.6, 0.55, 0.4))
-    return [single_cloth(twill, False, 0.09 * 8.0 ** (k / max(steps - 1, 1)), f"zoom {k}") for k in range(steps)]
+    found = []
+    for k in range(steps):
+        distance = 0.02 * 64.0 ** (k / max(steps - 1, 1))
+        side = 4.0 * distance
+
+        def sheet(a: Floats, b: Floats, side: float = side) -> Floats:
+            return np.stack([side * (a - 0.5), np.zeros_like(a), side * (0.5 - b)], axis=-1)
+
+        camera = camera_at(distance * np.array([0.0, 0.8, 0.6]), (0, 0, 0), 0.3)
+        mesh = patch(sheet, (side, side), (2, 2))
+        found.append(stage_of(f"zoom {k}", False, [mesh], [SUN, FILL], camera, [twill]))
+    return found
