@@ -79,9 +79,12 @@ def test_presets_are_clean_and_author_everything(name, tmp_path):
     stage = Usd.Stage.Open(str(path))
     prim = stage.GetPrimAtPath(FABRIC_PATH)
     names = [n for n in prim.GetPropertyNames() if n.startswith("usdfab:")]
-    assert len(names) == 15 + 2 * len(YARN_PARAMETERS)
+    assert len(names) == 16 + 2 * len(YARN_PARAMETERS)
     # without an albedo map there is none to author: an empty path is a broken reference to USD's own validators
-    assert [n for n in names if not prim.GetAttribute(n).HasAuthoredValue()] == ["usdfab:albedoMap"]
+    assert [n for n in names if not prim.GetAttribute(n).HasAuthoredValue()] == [
+        "usdfab:albedoMap",
+        "usdfab:neural:weights",
+    ]
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
     assert stage.GetRootLayer().customLayerData["usdfab"]["generator"].startswith("usdfab ")
 

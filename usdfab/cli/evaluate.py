@@ -10,7 +10,7 @@ from usdfab.errors import UsdfabError
 
 
 def run(
-    what: Literal["photos", "fits", "losses", "raster", "ablation", "path", "network", "table2", "surface"],
+    what: Literal["photos", "fits", "losses", "raster", "ablation", "path", "network", "table2", "surface", "neural"],
     folder: Path | None = None,
     dataset: Path | None = None,
     /,
@@ -42,6 +42,7 @@ def run(
         usdfab evaluate network weights.safetensors fabrics --photos FOLDER
         usdfab evaluate table2 -o table2 --stages analysis,match --quality draft
         usdfab evaluate surface -o surface --quality draft
+        usdfab evaluate neural -o neural --ablation
 
     Parameters
     ----------
@@ -55,7 +56,8 @@ def run(
         from (needs the fit extra). table2: random fabrics fitted from nothing but their picture, errors in the layout
         of Table 2 of Li et al. 2024; the same command goes on with a run that was broken off (needs the fit extra).
         surface: two surface models beside the fibers, plain, twill and satin, close up and at a distance, as in figure
-        11 of that paper.
+        11 of that paper. neural: the neural material beside the surface model that it learned, at 1 and 3 samples and
+        in equal time, in five scenes, along a zoom, and with mixed codes.
     folder:
         Of photos, fits and losses: holds the photos. For photos also SOURCES.csv with the columns file, weave and notes
         ("about N yarns across horizontally and M vertically"); for losses two or more PNG files. Of network: its
@@ -66,20 +68,22 @@ def run(
         Of losses: compute as the fit does, in bfloat16 where the processor has it.
     count:
         Of raster and ablation (1 by default) and of table2 (3): fabrics of each weave; of path (1): how many fabrics,
-        plain, twill and satin in turn.
+        plain, twill and satin in turn. Of neural: pixels on a side of each picture.
     quality:
         Of fits, raster, ablation, path and table2: resolution, samples and iterations, as of ``usdfab fit``; of table2
         also of the picture that is fitted: 240 pixels at 64 samples, denoised; 480 at 256; 720 at 1024. Of surface:
-        pixels and samples of the pictures.
+        and neural: pixels and samples of the pictures.
     ablation:
-        Of raster: each fabric also without parts of the shading and of the losses (six fits for each).
+        Of raster: each fabric also without parts of the shading and of the losses (six fits for each). Of neural: also
+        train the paper's network, on few materials, with and without its one-blob encoding and spatial fusion.
     fibers:
         Of raster and ablation: fibers in a yarn, instead of about 200, to save time.
     output:
         Of ablation: a folder for its pictures (the target, then each way, side by side) and ablation.json. Of fits: a
         folder for each photo's asset, picture (photo, then each stage) and numbers. Of table2: such a folder too, with
         each true fabric and its photo. Of surface: a folder for surface.png (rows plain, twill and satin, close and
-        distant; columns Irawan and Marschner 2012, Jin et al. 2022, fibers) and surface.json.
+        distant; columns Irawan and Marschner 2012, Jin et al. 2022, fibers) and surface.json. Of neural: a folder for a
+        picture of each scene (network, surface model with 1, with 3 and in equal time, truth), zoom.png, neural.json.
     stages:
         Of fits and table2: as of ``usdfab fit``.
     dataset:
@@ -89,14 +93,14 @@ def run(
     analysis:
         Of network: also analyse each picture of the data set (slow).
     """
-    if output is not None and what not in ("ablation", "fits", "table2", "surface"):
+    if output is not None and what not in ("ablation", "fits", "table2", "surface", "neural"):
         raise UsdfabError(f"evaluate {what} writes no files", place="--output", remedy="leave it out")
     if what == "network":
         _network(folder, dataset, photos, analysis, json)
         return
     if dataset is not None or photos is not None:
         raise UsdfabError(f"evaluate {what} takes no data set", place=str(dataset or photos), remedy="leave it out")
-    if what in ("raster", "ablation", "path", "table2", "surface"):
+    if what in ("raster", "ablation", "path", "table2", "surface", "neural"):
         if folder is not None:
             raise UsdfabError(
                 f"evaluate {what} makes its own fabrics", place=str(folder), remedy="leave the folder out"
@@ -105,6 +109,11 @@ def run(
             from usdfab.cli.evaluate_surface import surface
 
             surface(seed, quality, output, overwrite, json)
+            return
+        if what == "neural":
+            from usdfab.cli.evaluate_neural import neural
+
+            neural(seed, quality, output, overwrite, json, ablation=ablation, pixels=count)
             return
         if what == "table2":
             _table2(3 if count is None else count, seed, quality, stages, output, json)

@@ -101,7 +101,7 @@ def produce_queries(
     UsdfabError
         If the disk refuses.
     """
-    counts = [len(part) for part in np.array_split(np.arange(queries), PIECES)]
+    counts = [len(part) for part in np.array_split(np.arange(queries), min(PIECES, queries))]
     plan = [(JUDGES, JUDGE_SAMPLES, 2), *((count, samples, 1) for count in counts)]
     made: list[list[Piece]] = [[], []]
     for number, (count, paths, times) in enumerate(plan):

@@ -36,7 +36,7 @@ from usdfab.neural.rendered_material import learned_material, reversed_material
 from usdfab.neural.surface_from_fabric import surface_from_fabric
 from usdfab.torch_run import deterministic, one_thread
 
-FLOOR = 0.3
+FLOOR = 1.0
 """Of the weights of squares, in means of a column: what is darker counts no more."""
 
 GLOSS_WEIGHT = 0.25
@@ -64,7 +64,7 @@ class AssetSettings:
     epochs: int = 5
     batch: int = 8192
     code_rate: float = 1e-2
-    decoder_rate: float = 2e-3
+    decoder_rate: float = 1e-2
     seed: int = 0
 
     def __post_init__(self) -> None:
