@@ -93,6 +93,14 @@ def test_a_count_of_the_network_throws_the_weave_of_the_wrong_lattice_out() -> N
     assert fabric.cover("warp") == pytest.approx(shown().cover("warp"))
 
 
+def test_the_weave_of_the_networks_own_lattice_is_no_evidence_for_another() -> None:
+    """Satins look plain to who takes two picks for one."""
+    halved = guess("plain", 0.99, weft=9.9)
+    found = both(halved, analysis("satin", 0.2, count_sure=1.0), shown("satin"))
+    assert found.counts[1] == 19.8 and found.label == "satin" and found.weave is NAMED_WEAVES["satin"]
+    assert both(guess("plain", 0.99), analysis("satin", 0.2, count_sure=1.0), shown("satin")).label == "plain"
+
+
 def test_the_surer_one_decides_the_weave() -> None:
     sure, unsure = analysis("twill_2_2", 0.95), analysis("twill_2_2", 0.0)
     fabric = shown("twill_2_2")

@@ -102,7 +102,10 @@ def combine(guess: Guess, analysis: PhotoAnalysis, shown: FabricParameters, skil
     # A weave read on a wrong lattice is no evidence.
     confidence = 0.0 if moved else analysis.weave_confidence
     mine = weave_label(analysis.weave)
-    odds = combined_weave(guess.weave, mine, confidence, trusted=not moved)
+    # Neither is the network's, on its own lattice.
+    other_lattice = bool((np.abs(np.log(counts / guess.counts)) > SAME_COUNT).any())
+    seen_weave = np.full(len(LABELS), 1.0 / len(LABELS)) if other_lattice and not moved else guess.weave
+    odds = combined_weave(seen_weave, mine, confidence, trusted=not moved)
     label = LABELS[int(odds.argmax())]
     weave = analysis.weave
     if label != mine:
