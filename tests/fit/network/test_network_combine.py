@@ -10,7 +10,16 @@ import pytest
 
 from usdfab.fabric import FabricParameters, YarnParameters
 from usdfab.fabric.weave import NAMED_WEAVES, twill
-from usdfab.fit.network.combine import Combined, average, combine, combined_count, combined_weave, fabric_of, speaks
+from usdfab.fit.network.combine import (
+    BETTER_THAN_ASSUMED,
+    Combined,
+    average,
+    combine,
+    combined_count,
+    combined_weave,
+    fabric_of,
+    speaks,
+)
 from usdfab.fit.network.labels import LABELS
 from usdfab.fit.network.predict import LOOKS, Guess, estimates, turned_back, values_back
 from usdfab.fit.network.spectra import BINS, FREQUENCIES
@@ -139,6 +148,8 @@ def test_a_network_without_skill_changes_nothing() -> None:
     # Size over spacing of the analysis is the fabric's count here.
     assert fabric_of(fabric, found, speaks(skill)) == fabric
     assert not speaks(skill).any() and not speaks({}).any()
+    little = speaks(dict.fromkeys(NAMES, 0.95))
+    assert {name for name, heard in zip(NAMES, little, strict=True) if heard} == set(BETTER_THAN_ASSUMED)
 
 
 def test_what_the_network_knows_goes_into_the_fabric() -> None:
