@@ -10,7 +10,16 @@ import pytest
 
 from usdfab.fabric import FabricParameters, YarnParameters
 from usdfab.fabric.weave import NAMED_WEAVES, twill
-from usdfab.fit.network.combine import Combined, average, combine, combined_count, combined_weave, fabric_of, speaks
+from usdfab.fit.network.combine import (
+    BETTER_THAN_ASSUMED,
+    Combined,
+    average,
+    combine,
+    combined_count,
+    combined_weave,
+    fabric_of,
+    speaks,
+)
 from usdfab.fit.network.labels import LABELS
 from usdfab.fit.network.predict import LOOKS, Guess, estimates, turned_back, values_back
 from usdfab.fit.network.spectra import BINS, FREQUENCIES
@@ -93,6 +102,14 @@ def test_a_count_of_the_network_throws_the_weave_of_the_wrong_lattice_out() -> N
     assert fabric.cover("warp") == pytest.approx(shown().cover("warp"))
 
 
+def test_the_weave_of_the_networks_own_lattice_is_no_evidence_for_another() -> None:
+    """Satins look plain to who takes two picks for one."""
+    halved = guess("plain", 0.99, weft=9.9)
+    found = both(halved, analysis("satin", 0.2, count_sure=1.0), shown("satin"))
+    assert found.counts[1] == 19.8 and found.label == "satin" and found.weave is NAMED_WEAVES["satin"]
+    assert both(guess("plain", 0.99), analysis("satin", 0.2, count_sure=1.0), shown("satin")).label == "plain"
+
+
 def test_the_surer_one_decides_the_weave() -> None:
     sure, unsure = analysis("twill_2_2", 0.95), analysis("twill_2_2", 0.0)
     fabric = shown("twill_2_2")
@@ -131,6 +148,8 @@ def test_a_network_without_skill_changes_nothing() -> None:
     # Size over spacing of the analysis is the fabric's count here.
     assert fabric_of(fabric, found, speaks(skill)) == fabric
     assert not speaks(skill).any() and not speaks({}).any()
+    little = speaks(dict.fromkeys(NAMES, 0.95))
+    assert {name for name, heard in zip(NAMES, little, strict=True) if heard} == set(BETTER_THAN_ASSUMED)
 
 
 def test_what_the_network_knows_goes_into_the_fabric() -> None:
