@@ -79,7 +79,7 @@ def optics_of(fabric: FabricParameters) -> Optics:
     for system in SYSTEMS:
         if fabric.system(system).albedo_variation > 0.0:
             raise UsdfabError(
-                "gradients, the raster and path stages and flattened fibers know one albedo for all fibers of a yarn",
+                "gradients and the raster and path stages know one albedo for all fibers of a yarn",
                 place=f"{system}.albedo_variation",
                 remedy=f"set {system}.albedo_variation to 0",
             )
