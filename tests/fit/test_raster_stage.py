@@ -35,9 +35,7 @@ CLOTH = FabricParameters(
     weave_from_name("plain"), (2e-3, 2e-3),
     replace(YARN, albedo=(0.7, 0.4, 0.2)), replace(YARN, albedo=(0.2, 0.4, 0.6)), seed=3,
 )  # fmt: skip
-QUICK = StageSettings(
-    width=48, supersampling=1, steps="adam", iterations=12, rate=0.08, tied=False, levels=(1, 2, 4), prior=0.0
-)
+QUICK = StageSettings(width=48, supersampling=1, iterations=12, rate=0.08, levels=(1, 2, 4), prior=0.0)
 ROUNDS = replace(QUICK, steps="newton", iterations=2, prior=1.0)
 
 
