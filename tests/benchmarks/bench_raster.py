@@ -6,7 +6,7 @@
 An iteration is a picture, its losses (features included) and their gradient by all that stage 2 moves. Prints one line
 of JSON:
 
-    iteration_s     the best of the runs; standard_s: 75 of them, what ``usdfab fit --quality standard`` takes at 360
+    iteration_s     the best of the runs; adam_s: 75 of them, a whole descent by Adam at 360
     seconds         where they go: least seconds of each part, forward and backward. Features are measured by
                     themselves, forward and backward; the geometry's backward is what is left
     peers           at --peer-width, single scattering and diffuse alone without the features: ours; the same picture
@@ -158,7 +158,7 @@ def iteration(fabric: FabricParameters, width: int, runs: int) -> dict[str, Any]
         "vertices": pixels.model.vertices,
         "parameters": len(parameters.free),
         "iteration_s": total,
-        "standard_s": QUALITIES["standard"].iterations * total,
+        "adam_s": QUALITIES["paper"].iterations * total,
         "seconds": {k: round(v, 4) for k, v in seconds.items()},
     }
 

@@ -36,6 +36,7 @@ CLOTH = FabricParameters(
     replace(YARN, albedo=(0.7, 0.4, 0.2)), replace(YARN, albedo=(0.2, 0.4, 0.6)), seed=3,
 )  # fmt: skip
 QUICK = StageSettings(width=48, supersampling=1, iterations=12, rate=0.08, levels=(1, 2, 4), prior=0.0)
+ROUNDS = replace(QUICK, steps="newton", iterations=2, prior=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +63,35 @@ def test_a_wrong_shape_comes_back(net: FeatureNet, name: str, wrong: float) -> N
     errors = [abs(getattr(found.fabric.system(s), name) - true) for s in ("warp", "weft")]
     assert np.mean(errors) < 0.7 * abs(wrong - true)
     assert found.best_loss < found.losses[0]
+
+
+@pytest.mark.parametrize(("name", "wrong"), [("flattening", 1.9), ("radius", 1.7e-4)])
+def test_a_wrong_shape_comes_back_by_gauss_newton(net: FeatureNet, name: str, wrong: float) -> None:
+    target = shown(replace(CLOTH, seed=8), 0.25)
+    changed = {s: replace(CLOTH.system(s), **{name: wrong}) for s in ("warp", "weft")}  # type: ignore[arg-type]
+    found = refine_by_raster(
+        replace(CLOTH, **changed),
+        target,
+        replace(ROUNDS, free=(name,)),
+        net=net,
+        diffuse=0.25,  # type: ignore[arg-type]
+    )
+    errors = [abs(getattr(found.fabric.system(s), name) - getattr(YARN, name)) for s in ("warp", "weft")]
+    assert np.mean(errors) < 0.5 * abs(wrong - getattr(YARN, name))
+    assert found.best_loss < found.losses[0]
+
+
+def test_resumed_rounds_are_the_undisturbed_ones(net: FeatureNet, tmp_path: Path) -> None:
+    target = shown(replace(CLOTH, seed=8), 0.25)
+    start = replace(CLOTH, warp=replace(CLOTH.warp, crimp=1.2))
+    settings = replace(ROUNDS, free=("crimp", "albedo"))
+    whole = refine_by_raster(start, target, settings, net=net)
+    path = tmp_path / "raster.safetensors"
+    refine_by_raster(start, target, replace(settings, iterations=1), net=net, checkpoint=path)
+    rest = refine_by_raster(start, target, settings, net=net, checkpoint=path, resume=True)
+    assert rest.losses == whole.losses
+    assert rest.fabric == whole.fabric
+    assert np.array_equal(rest.render, whole.render)
 
 
 def test_wrong_colours_and_exposure_come_back(net: FeatureNet) -> None:

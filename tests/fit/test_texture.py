@@ -19,6 +19,8 @@ from usdfab.fit.texture import (
     gram_matrix,
     mean_and_covariance,
     reduced,
+    residual_weights,
+    residuals,
     rolled_off,
     texture_loss,
     texture_statistics,
@@ -50,6 +52,16 @@ def test_the_gram_loss_by_hand(tmp_path: Path) -> None:
             terms.append(np.abs(grams[0] - grams[1]).mean() / np.abs(grams[1]).mean())
     target = Target.from_image(b, net, (1, 2), "gram")
     assert float(texture_loss(a, target)) == pytest.approx(np.mean(terms), rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_weighted_residuals_add_up_to_the_losses(tmp_path: Path, kind: Kind) -> None:
+    net = small_net(tmp_path)
+    target = Target.from_image(picture(1), net, (1, 2), kind)
+    found, weights = residuals(picture(2), target), residual_weights(target, 0.7, 1.3)
+    whole = 0.7 * texture_loss(picture(2), target) + 1.3 * color_loss(picture(2), target)
+    assert float(found.abs() @ weights) == pytest.approx(float(whole), rel=1e-5)
+    assert residuals(picture(1), target).abs().max() == 0.0
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -89,10 +89,10 @@ class StageSettings:
 
     width: int = 360
     supersampling: int = 2
-    steps: Steps = "newton"
-    iterations: int = 5
+    steps: Steps = "adam"
+    iterations: int = 75
     rate: float = 0.03
-    tied: bool = True
+    tied: bool = False
     texture: float = 1.0
     color: float = 1.0
     prior: float = 1.0
@@ -104,9 +104,11 @@ class StageSettings:
 
 
 QUALITIES: dict[str, StageSettings] = {
-    "draft": StageSettings(width=128, supersampling=2, iterations=2, levels=(1, 2, 4), kind="gram"),
-    "standard": StageSettings(),
-    "paper": StageSettings(width=720, steps="adam", iterations=75, tied=False),
+    "draft": StageSettings(
+        width=128, supersampling=2, steps="newton", iterations=2, tied=True, levels=(1, 2, 4), kind="gram"
+    ),
+    "standard": StageSettings(steps="newton", iterations=5, tied=True),
+    "paper": StageSettings(width=720),
 }
 """What ``--quality`` means here.
 
