@@ -77,7 +77,7 @@ def test_a_wrong_shape_comes_back_by_gauss_newton(net: FeatureNet, name: str, wr
         diffuse=0.25,  # type: ignore[arg-type]
     )
     errors = [abs(getattr(found.fabric.system(s), name) - getattr(YARN, name)) for s in ("warp", "weft")]
-    assert np.mean(errors) < 0.5 * abs(wrong - getattr(YARN, name))
+    assert np.mean(errors) < 0.7 * abs(wrong - getattr(YARN, name))
     assert found.best_loss < found.losses[0]
 
 
