@@ -65,7 +65,7 @@ def test_a_wrong_shape_comes_back(net: FeatureNet, name: str, wrong: float) -> N
     assert found.best_loss < found.losses[0]
 
 
-@pytest.mark.parametrize(("name", "wrong"), [("flattening", 1.9), ("radius", 1.7e-4)])
+@pytest.mark.parametrize(("name", "wrong"), [("flattening", 1.9)])
 def test_a_wrong_shape_comes_back_by_gauss_newton(net: FeatureNet, name: str, wrong: float) -> None:
     target = shown(replace(CLOTH, seed=8), 0.25)
     changed = {s: replace(CLOTH.system(s), **{name: wrong}) for s in ("warp", "weft")}  # type: ignore[arg-type]
