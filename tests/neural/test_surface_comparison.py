@@ -159,7 +159,8 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_models_come_near_the_fibers(tiny: None) -> None:
-    result = compare_surfaces(Scale(32, 16, 32, 64, threads=1), weaves=("plain",))
+    # So few pixels want many samples: at 32 the mean of the fibers from afar is off by 15 % one time in a few.
+    result = compare_surfaces(Scale(32, 16, 256, 64, threads=1), weaves=("plain",))
     assert set(result.pictures) == {("plain", v, m) for v in ("close", "distant") for m in (IRAWAN, JIN, FIBERS)}
     for row in result.rows:
         assert 0.7 < row.brightness < 1.5 and 0 < row.flip < 0.6

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 SECONDS_PER_SAMPLE, SECONDS_PER_ITERATION = 2e-4, 4.0
 """Of the raster stage, about."""
 
+ITERATIONS_PER_ROUND = 10
+"""A round of Gauss-Newton renders some 35 pictures without derivatives: as long as so many of Adam's iterations."""
+
 SECONDS_PER_MILLION_PATHS, SECONDS_PER_STEP = 10.0, 2.0
 """Of the path stage, about."""
 
@@ -95,7 +98,8 @@ class LaterStages:
         for name in self.names:
             if name == "raster" and self.raster is not None:
                 samples = (self.raster.width * self.raster.supersampling) ** 2
-                work = self.raster.iterations * (SECONDS_PER_ITERATION + SECONDS_PER_SAMPLE * samples)
+                each = ITERATIONS_PER_ROUND if self.raster.steps == "newton" else 1
+                work = self.raster.iterations * each * (SECONDS_PER_ITERATION + SECONDS_PER_SAMPLE * samples)
             elif name == "network":
                 work = NETWORK_SECONDS
             elif name == "match" and self.match is not None:

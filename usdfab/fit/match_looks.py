@@ -5,8 +5,8 @@ valleys look like gaps, that they are spun hard the other way or plied, is no ne
 these are simply looked at, one question after the other, each with the answers to those before, and what comes closer
 to the photo is kept.
 
-Round, closed, bulging yarns under a lamp across them are what brought dark satin from 0.50 to 0.30 in distance: flat
-ones under a lamp near the camera have no shading, and only gaps could make the dark lines of the photo.
+Round, closed, bulging yarns under a lamp across them are what dark satin needs most: flat ones under a lamp near the
+camera have no shading, and only gaps could make the dark lines of the photo.
 """
 
 from __future__ import annotations

@@ -161,7 +161,8 @@ def run_raster(
         progress=lambda k, _: say("measuring albedo", done + ladder + k, steps),
     )
     notes += albedo_notes
-    halfway: FabricParameters | None = start_from_joint(result.fabric, result.diffuse)
+    # Where k_d is tied to C, that is C already: nothing lies halfway between them.
+    halfway = None if settings.tied else start_from_joint(result.fabric, result.diffuse)
     say("judging the raster stage", steps - 1, steps)
     judge = judge or settings
     known = straightened(photo, rotation, photo.shape[1] / start.size[0], judge.width / start.size[0])

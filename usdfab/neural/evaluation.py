@@ -118,15 +118,15 @@ def prepared(stage: Stage, networks: Mapping[str, Weights]) -> NeuralScene:
     sides = [side for cloth in stage.cloths for side in (cloth.material, reversed_material(cloth.material))]
     both = [plans_of(networks[kind].network, sides) for kind in KINDS]
     plans: list[Any] = [TimedPlan(both[kind][k]) for k in range(len(sides)) for kind in range(len(KINDS))]
-    albedo = np.stack([cloth.albedo for cloth in stage.cloths])
-    return replace(made, plans=plans, albedo=albedo)
+    albedo = np.stack([cloth.albedo for cloth in stage.cloths]).astype(np.float32)
+    return replace(made, plans=plans, decoders=None, albedo=albedo)
 
 
 def with_surface(made: NeuralScene, stage: Stage, samples: int, seed: int) -> NeuralScene:
     """The same scene with the surface model's answers."""
     sides = [side for cloth in stage.cloths for side in (cloth.material, reversed_material(cloth.material))]
     plans: list[Any] = [SurfacePlan(side, below, samples, seed) for side in sides for below in (False, True)]
-    return replace(made, plans=plans)
+    return replace(made, plans=plans, decoders=None)
 
 
 def shown(
