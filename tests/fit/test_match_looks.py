@@ -143,6 +143,7 @@ def test_closed_cloth_is_found_from_open_one(net: FeatureNet) -> None:
     assert result.losses[1] < 0.5 * result.losses[0]
 
 
+@pytest.mark.slow
 def test_the_ring_is_found(net: FeatureNet) -> None:
     """Lamps to the side are not told apart here: plain weave looks alike when it is turned or mirrored."""
     truth = RING(Seen(CLOTH, None))
