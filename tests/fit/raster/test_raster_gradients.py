@@ -83,6 +83,10 @@ def test_without_edges_the_gradient_is_wrong():
         # the next, far more than the fit's error tells.
         (True, 0.06, 13),
         pytest.param(
+            True, 0.02, 7,
+            marks=pytest.mark.xfail(reason="the warp's inclination is 16 % off these short differences", strict=True),
+        ),
+        pytest.param(
             False, 0.06, 13,
             marks=pytest.mark.xfail(
                 reason="the weft's radius is 20 %, its flattening 14 % off: single scattering at silhouettes",
