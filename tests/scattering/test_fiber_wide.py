@@ -36,12 +36,12 @@ def _slopes(m, turn, low, high, sin_to, cos_to, sin_ti, cos_ti, phi, weights, ro
 def test_value_and_derivatives_are_those_of_torch(
     albedo, gamma_m, gamma_n, gamma_m0, eta, tilt, h, spread, to, ti, phi, weights
 ):
-    # D has a kink at half a turn, where it is trimmed.
-    ratio = math.cos(to) / math.sqrt(eta**2 - math.sin(to) ** 2)
-    inner = 2.0 * math.asin(h * ratio)
-    centers = np.array([0.0, inner + math.pi, 2.0 * inner]) - 2.0 * math.asin(h)
-    assume((np.cos(phi - centers) > -1.0 + 1e-6).all())
     low, high = max(h - spread / 2, -0.995), min(h + spread / 2, 0.995)
+    # D has a kink at half a turn, where it is trimmed; either end may be there, too.
+    at = np.array([low, h, high])
+    inner = 2.0 * np.arcsin(at * math.cos(to) / math.sqrt(eta**2 - math.sin(to) ** 2))
+    centers = np.array([0.0 * inner, inner + math.pi, 2.0 * inner]) - 2.0 * np.arcsin(at)
+    assume((np.cos(phi - centers) > -1.0 + 1e-6).all())
     parameters = torch.tensor([*albedo, gamma_m, gamma_n, gamma_m0, eta], dtype=torch.float64)
     packed = fiber_torch.pack_fiber(parameters[:3], *parameters[3:], tilt=tilt)
     constants = torch.stack([*packed.sigma, packed.eta, packed.inv_s, packed.d_scale, *packed.inv_v, *packed.m_scale])

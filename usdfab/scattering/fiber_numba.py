@@ -50,14 +50,17 @@ __all__ = [
     "PREPARED_FIBER",
     "ROUGHNESS_RANGE",
     "eval_fiber",
+    "eval_fiber_tt",
     "fiber_angles",
     "fiber_direction",
     "fiber_frame",
     "load_fiber",
+    "longitudinal_tt",
     "pack_fiber",
     "prepare_fiber",
     "sample_fiber",
     "sample_fiber_lobe",
+    "turn_tt",
 ]
 
 ETA_TEXTILE = 1.55
@@ -473,6 +476,29 @@ def eval_fiber(p, prep, sin_ti, cos_ti, phi):
         pdf += lobe * q_trt
 
     return red, green, blue, pdf
+
+
+@njit(**_OPTIONS)
+def turn_tt(h, eta2):
+    """2 gamma_t - 2 gamma_o, rad: how far light that goes through a fiber at offset h turns; eta2 is eta' squared."""
+    return 2.0 * (_asin(h / math.sqrt(eta2)) - _asin(h))
+
+
+@njit(**_OPTIONS)
+def longitudinal_tt(p, sin_ti, cos_ti, sin_to, cos_to):
+    """M of the TT lobe, see `eval_fiber`."""
+    sin_tt = sin_to * p[_COS_TILT + 1] - cos_to * p[_SIN_TILT + 1]
+    cos_tt = abs(cos_to * p[_COS_TILT + 1] + sin_to * p[_SIN_TILT + 1])
+    return _longitudinal(p[_M_SCALE + 1], p[_INV_V + 1], sin_ti, cos_ti, sin_tt, cos_tt)
+
+
+@njit(**_OPTIONS)
+def eval_fiber_tt(p, prep, sin_ti, cos_ti, phi):
+    """The part of `eval_fiber` that the TT lobe has: (fr, fg, fb)."""
+    d = _azimuthal(p, phi - prep[9])
+    if d > 0.0:
+        d *= _longitudinal(p[_M_SCALE + 1], p[_INV_V + 1], sin_ti, cos_ti, prep[2], prep[3])
+    return d * prep[12], d * prep[13], d * prep[14]
 
 
 @njit(**_OPTIONS)

@@ -1,4 +1,4 @@
-"""The path tracer with derivatives: the same paths as ``kernel.render_tile`` takes, with a tape."""
+"""The path tracer with derivatives: paths as ``kernel.render_tile`` takes them, with a tape."""
 
 from __future__ import annotations
 

@@ -59,6 +59,12 @@ def words_at(address):
     return carray(_as_pointer(address), 1 << 40, np.uint32)
 
 
+@njit(cache=True, inline="always")
+def floats_at(address):
+    """The memory at an address as float32; who calls it knows how many there are."""
+    return carray(_as_pointer(address), 1 << 40, np.float32)
+
+
 def _borrow(typingctx, array):
     signature = array(array)
 

@@ -20,6 +20,7 @@ from usdfab.scattering.fiber_numba import (
     FIBER_SIZE,
     PREPARED_FIBER,
     eval_fiber,
+    eval_fiber_tt,
     fiber_angles,
     fiber_direction,
     fiber_frame,
@@ -30,13 +31,14 @@ from usdfab.scattering.fiber_numba import (
 )
 from usdfab.scattering.fiber_numba_grad import PREPARED_SLOPES, prepare_slopes
 from usdfab.scattering.surface_numba import PREPARED_SURFACE, eval_surface, prepare_surface, sample_surface
+from usdfab.tracer.aimed import AZIMUTH, LEAST, NARROW, NO_FLIGHT, aim, aimed_light, fiber_at, flight_from, share_aimed
 from usdfab.tracer.counted import next_uniform
 from usdfab.tracer.film import ALBEDO, ALPHA, DEPTH, DIRECT, FIBER_ID, NORMAL, RAYS, SAMPLES, UV, YARN_ID
-from usdfab.tracer.intrinsics import KERNEL, NG, PRIM, U, borrow, new_ray_buffer
+from usdfab.tracer.intrinsics import KERNEL, PRIM, borrow, new_ray_buffer
 from usdfab.tracer.lights import FAR, escaped_radiance, hit_light, light_blocks, sample_light
-from usdfab.tracer.slab import HIT, enter_slab, inverse_columns, leave_slab, slab_occluded, to_patch, trace_slab
-from usdfab.tracer.surfaces import MAX_SURFACES, surface_frame, trace_macro, transmittance
-from usdfab.tracer.tangents import tangent_at
+from usdfab.tracer.slab import HIT, enter_slab, inverse_columns, leave_slab, to_patch, trace_slab
+from usdfab.tracer.surfaces import MAX_SURFACES, light_share, surface_frame, trace_macro, transmittance
+from usdfab.tracer.tangents import radius_at
 from usdfab.tracer.tape import start_tape, tape_direct, tape_light, tape_scatter
 from usdfab.tracer.textures import normal_at, opacity_at, surface_at
 from usdfab.tracer.vertex import camera_sample, pixel_shift, shading_frame, tint_at, tint_fiber, to_local
@@ -63,7 +65,8 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
     """Radiance along a camera ray. Adds to ``out``, the film's channels of the pixel.
 
     With a ``Tape`` it adds derivatives to that; with None Numba leaves all of that out of what it compiles. The path is
-    the same either way; with lamps that have an extent its weights are not, but in the mean.
+    the same either way; its weights are not, but in the mean: with lamps that have an extent, and with narrow lobes,
+    whose light only paths without a tape aim (``aimed.py``).
     """
     macro, patches, lights = world.macro, world.patches, world.lights
     light_count = len(lights.table)
@@ -84,6 +87,7 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
     slab_mesh = nowhere
     first = True
     travelled = 0.0
+    flight, sent = NO_FLIGHT, False
     tx = ty = 0.0
     if tape is not None:
         start_tape(tape)
@@ -94,6 +98,7 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
         finished = False
         prim, material, hu, hv, gx, gy, gz = np.int64(0), np.int64(0), 0.0, 0.0, 0.0, 0.0, 1.0
         frame = m
+        straight = sent
         for _ in range(MAX_SURFACES):
             if in_slab:
                 px, py, pz = to_patch(m, dx, dy, dz)
@@ -110,6 +115,7 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
                     fiber = True
                     break
                 in_slab = False
+                straight = False
                 back, thickness = leave_slab(patches, first_patch, up, pz)
                 ox, oy, oz = ox - back * dx, oy - back * dy, oz - back * dz
                 travelled -= back
@@ -168,31 +174,19 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
             break
 
         # Shading frame at the interaction.
-        floats, words, _address = buffer
+        _floats, words, _address = buffer
+        h = sin_to = cos_to = radius = 0.0
+        curve = nowhere
         fiber_material, prepared, surface, slopes = _NO_FIBER, _NOT_PREPARED, _NO_SURFACE, _NO_SLOPES
         row = nowhere
         shading = m
         ax = ay = az = ex = ey = ez = fx = fy = fz = 0.0
         wox = woy = woz = 0.0
         if fiber:
-            curve, qx, qy, qz = tangent_at(patches.records, patch, np.int64(words[PRIM]), np.float64(floats[U]))
+            radius = radius_at(patches.records, patch, np.int64(words[PRIM])) / up
+            curve, ax, ay, az, nx, ny, nz = fiber_at(patches, buffer, patch, m, inverse)
             owner = patches.curves[int(patches.table[patch, FIRST_CURVE]) + curve]
             row = np.int64(owner[MATERIAL])
-            # Tangents are vectors, normals covectors.
-            ax = qx * inverse[0] + qy * inverse[3] + qz * inverse[6]
-            ay = qx * inverse[1] + qy * inverse[4] + qz * inverse[7]
-            az = qx * inverse[2] + qy * inverse[5] + qz * inverse[8]
-            norm = 1.0 / math.sqrt(ax * ax + ay * ay + az * az)
-            ax, ay, az = ax * norm, ay * norm, az * norm
-            qx, qy, qz = np.float64(floats[NG]), np.float64(floats[NG + 1]), np.float64(floats[NG + 2])
-            nx = qx * m[0] + qy * m[3] + qz * m[6]
-            ny = qx * m[1] + qy * m[4] + qz * m[7]
-            nz = qx * m[2] + qy * m[5] + qz * m[8]
-            # Embree's normal belongs to the straight segment; h wants it in the plane normal to the spline's tangent.
-            dot = nx * ax + ny * ay + nz * az
-            nx, ny, nz = nx - dot * ax, ny - dot * ay, nz - dot * az
-            norm = 1.0 / math.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-300))
-            nx, ny, nz = nx * norm, ny * norm, nz * norm
             fiber_material = load_fiber(patches.materials, row)
             if tinted:
                 fiber_material = tint_fiber(fiber_material, patches.albedo, row, tint_r, tint_g, tint_b)
@@ -262,8 +256,8 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
                 fr, fg, fb = beta_r * fr * weight, beta_g * fg * weight, beta_b * fb * weight
                 likely = max(fr, fg, fb) * SHADOW_ROULETTE
                 if likely < 1.0 and depth > 1:
-                    stream, u0 = next_uniform(stream)
-                    likely = 1.0 / likely if u0 < likely else 0.0
+                    stream, u3 = next_uniform(stream)
+                    likely = 1.0 / likely if u3 < likely else 0.0
                 else:
                     likely = 1.0
                 cr, cg, cb = likely * fr * lr, likely * fg * lg, likely * fb * lb
@@ -271,25 +265,24 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
                 # Area lights stand in each other's way, as they do for rays that the BSDF draws.
                 if cr + cg + cb > 0.0 and not light_blocks(lights, ox, oy, oz, wx, wy, wz, reach):
                     out[RAYS] += 1.0
-                    share = 1.0
                     if fiber:
-                        px, py, pz = to_patch(m, wx, wy, wz)
-                        stretch = math.sqrt(px * px + py * py + pz * pz)
-                        blocked, through = slab_occluded(
-                            world.embree[1], patches.table, patches.handles, buffer, first_patch, variants, lx, ly, lz,
-                            ix, iy, px / stretch, py / stretch, pz / stretch, reach * stretch,
+                        share = light_share(
+                            world, buffer, time, first_patch, variants, m, up, slab_mesh, ox, oy, oz, lx, ly, lz, ix,
+                            iy, wx, wy, wz, reach,
                         )  # fmt: skip
-                        share = 0.0 if blocked else 1.0
-                        if not blocked and through < reach * stretch:
-                            back, thickness = leave_slab(patches, first_patch, up, pz)
-                            start = through / stretch - back
-                            out[RAYS] += 1.0
-                            share = transmittance(
-                                world, buffer, time, ox + start * wx, oy + start * wy, oz + start * wz, wx, wy, wz,
-                                0.0, reach - start, slab_mesh, back + 2.0 * thickness,
-                            )  # fmt: skip
                     else:
                         share = transmittance(world, buffer, time, ox, oy, oz, wx, wy, wz, near, reach, nowhere, 0.0)
+                    if tape is None and straight and share > 0.0:
+                        fr, fg, fb = eval_fiber_tt(fiber_material, prepared, sin_ti, cos_ti, phi)
+                        if fr + fg + fb > 0.0:
+                            stream, left = share_aimed(
+                                world, buffer, stream, (first_patch, variants), m, inverse, flight,
+                                (patch, ix, iy, curve), fiber_material, radius, max(beta_r, beta_g, beta_b),
+                                (u0, u1, u2), out,
+                            )  # fmt: skip
+                            cr = max(cr - left * likely * beta_r * fr * lr, 0.0)
+                            cg = max(cg - left * likely * beta_g * fg * lg, 0.0)
+                            cb = max(cb - left * likely * beta_b * fb * lb, 0.0)
                     cr, cg, cb = share * cr, share * cg, share * cb
                     total_r, total_g, total_b = total_r + cr, total_g + cg, total_b + cb
                     if tape is not None:
@@ -299,9 +292,24 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
                             tape_direct(tape, row, fiber_material, prepared, slopes, sin_ti, cos_ti, phi, cr, cg, cb)
                     if depth == 1:
                         direct_r, direct_g, direct_b = direct_r + cr, direct_g + cg, direct_b + cb
+                if tape is None and straight:
+                    aimed = aim(
+                        fiber_material, h, sin_to, cos_to, sin_ti, cos_ti, phi, prepared[9], (ex, ey, ez),
+                        (fx, fy, fz), dx, dy, dz, math.sqrt((ox - sx) ** 2 + (oy - sy) ** 2 + (oz - sz) ** 2), radius,
+                        flight, flight[AZIMUTH],
+                    )  # fmt: skip
+                    # Calls cost their arguments, so only where it pays.
+                    if max(beta_r, beta_g, beta_b) * aimed[0] >= LEAST:
+                        stream, cr, cg, cb = aimed_light(
+                            world, buffer, stream, time, (first_patch, variants), m, inverse, up, slab_mesh, flight,
+                            (patch, ix, iy, curve), fiber_material, prepared, aimed, (beta_r, beta_g, beta_b),
+                            (u0, u1, u2), out,
+                        )  # fmt: skip
+                        total_r, total_g, total_b = total_r + cr, total_g + cg, total_b + cb
 
         # Next direction: BSDF sampling.
         sx, sy, sz = ox, oy, oz
+        sent = False
         stream, u0 = next_uniform(stream)
         stream, u1 = next_uniform(stream)
         stream, u2 = next_uniform(stream)
@@ -315,6 +323,12 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
                 if tape is not None:
                     # The same direction, weighed as the tape knows it.
                     _s, _c, _p, wr, wg, wb = sample_fiber_lobe(fiber_material, prepared, u0, u1, u2, u3)
+            sent = lights.deltas and fiber_material[11] < NARROW
+            if tape is None and sent:
+                flight = flight_from(
+                    (ax, ay, az, ex, ey, ez, fx, fy, fz), sin_ti, cos_ti, phi, fiber_material[11], u0, prepared, ox, oy,
+                    oz, lx, ly, lz, ix, iy,
+                )  # fmt: skip
             if tape is not None:
                 tape_scatter(tape, row, fiber_material, prepared, slopes, u0, sin_ti, cos_ti, phi)
             dx, dy, dz = fiber_direction(ax, ay, az, ex, ey, ez, fx, fy, fz, sin_ti, cos_ti, phi)

@@ -288,9 +288,9 @@ def pack_patches(scenes: list[PatchScene]) -> Patches:
     return Patches(
         table=np.array(rows, dtype=float).reshape(-1, PATCH_COLUMNS),
         handles=np.array([s.scene.handle for s in scenes], dtype=np.uint64),
-        records=np.array([[s.tangents.ctypes.data, s.segments.ctypes.data] for s in scenes], dtype=np.uint64).reshape(
-            -1, 2
-        ),
+        records=np.array(
+            [[a.ctypes.data for a in (s.tangents, s.segments, s.vertices)] for s in scenes], dtype=np.uint64
+        ).reshape(-1, 3),
         # Without fabrics one row of each: kernels read it before they know whether they need it.
         materials=np.concatenate([s.materials for s in scenes] or [np.zeros((1, FIBER_SIZE))]),
         albedo=np.concatenate([s.albedo for s in scenes] or [np.zeros((1, 4))]),

@@ -190,3 +190,35 @@ def transmittance(world, buffer, time, ox, oy, oz, dx, dy, dz, near, tmax, skip_
         if tmax <= exit_back:
             return share
     return 0.0
+
+
+@njit(**KERNEL, forceinline=True)
+def light_share(
+    world, buffer, time, first, count, m, up, slab_mesh, ox, oy, oz, lx, ly, lz, ix, iy, wx, wy, wz, reach
+):  # fmt: skip
+    """Share of a lamp's light that comes to a fiber: fibers of its own cloth stop it, then ``transmittance``.
+
+    Parameters
+    ----------
+    first, count, m, up, slab_mesh, lx, ly, lz, ix, iy:
+        The cloth and the place in its tile, as ``enter_slab`` has them; ``ox, oy, oz`` is the same place in the world.
+    wx, wy, wz, reach:
+        Unit direction to the lamp, and how far.
+    """
+    patches = world.patches
+    px, py, pz = to_patch(m, wx, wy, wz)
+    stretch = math.sqrt(px * px + py * py + pz * pz)
+    blocked, through = slab_occluded(
+        world.embree[1], patches.table, patches.handles, buffer, first, count, lx, ly, lz, ix, iy, px / stretch,
+        py / stretch, pz / stretch, reach * stretch,
+    )  # fmt: skip
+    if blocked:
+        return 0.0
+    if through >= reach * stretch:
+        return 1.0
+    back, thickness = leave_slab(patches, first, up, pz)
+    start = through / stretch - back
+    return transmittance(
+        world, buffer, time, ox + start * wx, oy + start * wy, oz + start * wz, wx, wy, wz, 0.0, reach - start,
+        slab_mesh, back + 2.0 * thickness,
+    )  # fmt: skip

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from usdfab.tracer.intrinsics import KERNEL, words_at
+from usdfab.tracer.intrinsics import KERNEL, floats_at, words_at
 
 _SCALE = 32767.0
 
@@ -45,6 +45,12 @@ def _unpack(word):
     x, y = x - math.copysign(fold, x), y - math.copysign(fold, y)
     norm = 1.0 / math.sqrt(x * x + y * y + z * z)
     return norm * x, norm * y, norm * z
+
+
+@njit(**KERNEL, forceinline=True)
+def radius_at(records, patch, prim):
+    """Radius of the fiber that a segment belongs to, patch units."""
+    return np.float64(floats_at(records[patch, 2])[4 * np.int64(words_at(records[patch, 1])[2 * prim]) + 3])
 
 
 @njit(**KERNEL, forceinline=True)
