@@ -24,7 +24,7 @@ from usdfab.fit.albedo import (
 )
 from usdfab.fit.analysis import PhotoAnalysis, YarnSystem
 from usdfab.fit.pipeline import DEFAULT_WIDTH, fit_photo
-from usdfab.fit.priors import fabric_from_analysis
+from usdfab.fit.priors import assumed_notes, fabric_from_analysis
 from usdfab.imaging import write_image
 
 CLOTH = FabricParameters(
@@ -87,10 +87,16 @@ def test_twist_prior_reproduces_the_measured_fiber_angle(angle: float) -> None:
 
 def test_uncertain_estimates_give_way_to_priors() -> None:
     unsure = system(twist_confidence=0.1, width_confidence=0.1, fiber_angle=0.7, width=0.4)
-    fabric, notes = fabric_from_analysis(analysis(unsure, system()), 4e-3)
+    seen = analysis(unsure, system())
+    fabric, _ = fabric_from_analysis(seen, 4e-3)
     assert fabric.warp.twist == pytest.approx(0.08)
     assert fabric.cover("warp") > 1.0
-    assert any("twist of the warp" in note for note in notes)
+    notes = assumed_notes(seen, fabric, fabric)
+    assert any("twist of the warp" in note for note in notes) and not any("of the weft" in note for note in notes)
+    assert "fiber count, crimp" in notes[-1]
+    # What a later stage has found is no prior any more.
+    found = replace(fabric, warp=replace(fabric.warp, twist=0.2, crimp=0.5))
+    assert assumed_notes(seen, fabric, found) == (notes[-1].replace(" crimp,", ""),)
 
 
 def test_colors_of_ends_are_kept_unless_the_repeat_grows_too_large() -> None:

@@ -27,7 +27,7 @@ from usdfab.fit.doubts import Doubt, find_doubts
 from usdfab.fit.fit_checkpoint import CheckpointFiles, FitCheckpoint
 from usdfab.fit.later_stages import LaterStages
 from usdfab.fit.photo_input import DEFAULT_WIDTH as DEFAULT_WIDTH, Crop, Photo, load_photo
-from usdfab.fit.priors import fabric_from_analysis
+from usdfab.fit.priors import assumed_notes, fabric_from_analysis
 from usdfab.fit.stages import StageOutcome, checked_stages
 from usdfab.tracer.checkpoint import fingerprint
 from usdfab.usd.rig import Rig
@@ -149,6 +149,7 @@ def fit_photo(
         *_confidences(analysis),
         *warnings,
         *prior_notes,
+        *assumed_notes(analysis, shown, outcomes[-1].fabric),
     ]
     provenance = Provenance(
         source=Path(path).name,

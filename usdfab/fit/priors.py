@@ -37,6 +37,12 @@ MAX_REPEAT_CELLS = 1600
 VARIED_CELLS = 256
 """Crossings of all variants of the repeat together beyond which a yarn-dyed fabric gets fewer variants."""
 
+ASSUMED = (
+    "fiber_count", "crimp", "inclination", "migration", "migration_rate", "irregularity", "roughness_longitudinal",
+    "roughness_azimuthal", "roughness_primary",
+)  # fmt: skip
+"""What a photo's analysis does not measure."""
+
 
 def fabric_from_analysis(
     analysis: PhotoAnalysis, width: float, seed: int = 0, name: str = "Fabric"
@@ -53,24 +59,43 @@ def fabric_from_analysis(
     Returns
     -------
     fabric, notes:
-        Notes are sentences on what had to be assumed.
+        Notes are sentences on what the numbers of a fabric cannot say of the photo.
     """
     rows, columns = analysis.shape
     pixel = width / columns
     size = (width, rows * pixel)
     long_floats = analysis.weave_class == "satin"
-    notes = []
     systems = {}
     spacing = {"warp": analysis.warp.spacing * pixel, "weft": analysis.weft.spacing * pixel}
     for this, other in (("warp", "weft"), ("weft", "warp")):
         seen: YarnSystem = getattr(analysis, this)
         systems[this] = _yarn(seen, size[0 if this == "warp" else 1], spacing[this], spacing[other], long_floats)
-        if seen.twist_confidence < MIN_CONFIDENCE:
-            notes.append(f"twist of the {this} is a prior")
-    notes.append("fiber count, crimp, inclination, migration, noise and roughness are priors")
     fabric = FabricParameters(analysis.weave, size, systems["warp"], systems["weft"], seed, name)
     fabric, dyed_note = _with_yarn_colors(fabric, analysis)
-    return fabric, (*notes, *dyed_note)
+    return fabric, dyed_note
+
+
+def assumed_notes(analysis: PhotoAnalysis, start: FabricParameters, fabric: FabricParameters) -> tuple[str, ...]:
+    """Sentences on what is assumed in a fitted fabric: numbers that no stage has moved from ``fabric_from_analysis``.
+
+    Parameters
+    ----------
+    start, fabric:
+        What ``fabric_from_analysis`` made of the analysis, and what became of it.
+    """
+
+    def stays(name: str, systems: tuple[str, ...] = ("warp", "weft")) -> bool:
+        return all(getattr(start.system(s), name) == getattr(fabric.system(s), name) for s in systems)
+
+    notes = [
+        f"twist of the {system} is a prior"
+        for system in ("warp", "weft")
+        if getattr(analysis, system).twist_confidence < MIN_CONFIDENCE and stays("twist", (system,))
+    ]
+    names = [name.replace("_", " ") for name in ASSUMED if stays(name)]
+    if names:
+        notes.append(f"{', '.join(names)}: not estimated, typical values")
+    return tuple(notes)
 
 
 def _yarn(seen: YarnSystem, side: float, spacing: float, other_spacing: float, long_floats: bool) -> YarnParameters:
