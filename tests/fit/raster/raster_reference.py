@@ -248,13 +248,16 @@ class Reference:
         total = torch.zeros(len(pixels), 3, dtype=torch.float64)
         for k, lamp in enumerate(view.lamps):
             to_lamp = torch.from_numpy((lamp - self.starts(pixels)) / self.scale) - distance[:, None] * direction
-            light = self._shaded(look_, segment, tangent, h, direction, spread, to_lamp)
-            total = total + light * lit[k][:, None] * torch.from_numpy(view.intensity[k] / self.scale**2)
+            settings, rest = self.renderer.settings, self.renderer.settings.unshadowed
+            for part, shines in (("single", lit[k]), ("diffuse", rest + (1.0 - rest) * lit[k])):
+                if getattr(settings, part):
+                    light = self._shaded(part, look_, segment, tangent, h, direction, spread, to_lamp)
+                    total = total + light * shines[:, None] * torch.from_numpy(view.intensity[k] / self.scale**2)
         return total
 
-    def _shaded(self, look_, segment, tangent, h, ray, spread, offset) -> Tensor:
-        """Single scattering and diffuse light of pieces of equal angle, over the squared distance."""
-        settings, fabric = self.renderer.settings, self.renderer.fabric
+    def _shaded(self, part: str, look_, segment, tangent, h, ray, spread, offset) -> Tensor:
+        """Single scattering or diffuse light of pieces of equal angle, over the squared distance."""
+        fabric = self.renderer.fabric
         squared = dot(offset, offset)
         to_lamp = offset / torch.sqrt(squared)[:, None]
         total = torch.zeros(len(h), 3, dtype=torch.float64)
@@ -272,11 +275,11 @@ class Reference:
                 bounds = [torch.sin(low + (high - low) * (j / number)) for j in range(number + 1)]
                 light = torch.zeros(len(low), 3, dtype=torch.float64)
                 for a, b in itertools.pairwise(bounds):
-                    part = _radiance(
-                        material if settings.single else None, look_.diffuse[row] if settings.diffuse else None,
+                    piece = _radiance(
+                        material if part == "single" else None, look_.diffuse[row] if part == "diffuse" else None,
                         tangent[mine], 0.5 * (a + b), ray[mine], b - a, to_lamp[mine],
                     )  # fmt: skip
-                    light = light + ((b - a) / (bounds[-1] - bounds[0]))[:, None] * part
+                    light = light + ((b - a) / (bounds[-1] - bounds[0]))[:, None] * piece
                 total = total.index_add(0, mine.nonzero()[:, 0], light / squared[mine, None])
         return total
 

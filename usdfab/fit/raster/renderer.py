@@ -32,8 +32,9 @@ class RasterSettings:
     """How to rasterize.
 
     ``size`` (width, height) of the picture; ``supersampling`` squared pixels make one of them (the paper: 2 x 2).
-    ``single``, ``diffuse``, ``shadows``, ``edges`` switch off parts, for ablations. ``float64`` gives the picture in
-    double precision, in which it is computed, for gradient checks.
+    ``single``, ``diffuse``, ``shadows``, ``edges`` switch off parts, for ablations. ``unshadowed`` of the diffuse term
+    is there in shadows, too; none in the paper, see ``shade_kernel.UNSHADOWED``. ``float64`` gives it in double
+    precision, in which it is computed, for gradient checks.
     """
 
     size: tuple[int, int]
@@ -44,6 +45,7 @@ class RasterSettings:
     diffuse: bool = True
     shadows: bool = True
     edges: bool = True
+    unshadowed: float = 0.0
     float64: bool = False
 
 
@@ -78,7 +80,7 @@ class RasterRenderer:
         self._lighting = Lighting(
             self._view.lamps / scale, self._view.intensity / scale**2,
             cuticle_turns((fabric.warp.cuticle_tilt, fabric.weft.cuticle_tilt), self._color_system),
-            settings.single, settings.diffuse,
+            settings.single, settings.diffuse, settings.unshadowed,
         )  # fmt: skip
 
     def look_of(self, diffuse: float | np.ndarray = 0.3) -> Look:
