@@ -78,7 +78,8 @@ class LaterStages:
         Raises
         ------
         UsdfabError
-            For an unknown quality.
+            For an unknown quality; where the weights of the features, by which all stages are judged, are missing or
+            damaged.
         """
         names = tuple(name for name in wanted if name != "analysis")
         if not names:
@@ -86,7 +87,9 @@ class LaterStages:
         from usdfab.fit.match_stage import checked_match_quality
         from usdfab.fit.path_settings import settings_for
         from usdfab.fit.raster_stage import JUDGE, checked_quality
+        from usdfab.fit.weights_file import read_convolutions
 
+        read_convolutions("vgg16")
         raster = checked_quality(quality)
         # The exposure is found before: the path stage is to leave it as it is.
         path = settings_for(quality, seed=seed, gain=False)  # type: ignore[arg-type]
