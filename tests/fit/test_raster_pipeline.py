@@ -13,6 +13,7 @@ from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, YarnParameters, weave_from_name
 from usdfab.fabric.sampling import sample_fabric
 from usdfab.fit import features, raster_evaluation, raster_stage, stages as fit_stages, weights_file
+from usdfab.fit.later_stages import LaterStages
 from usdfab.fit.pipeline import fit_photo
 from usdfab.fit.raster.unconstrained import parameters_of
 from usdfab.fit.raster_evaluation import (
@@ -55,6 +56,14 @@ def test_stages_that_cannot_run_are_one_line(stages: tuple[str, ...], line: str)
     with pytest.raises(UsdfabError, match=line):
         checked_stages(stages)
     assert checked_stages(("path", "raster", "analysis")) == ("analysis", "raster", "path")
+
+
+def test_a_photo_with_too_few_rows_is_refused_before_any_work() -> None:
+    later = LaterStages.of(("analysis", "raster"), "draft", 0, 100, None)
+    later.require_room(np.zeros((100, 400, 3)), "strip.png")
+    with pytest.raises(UsdfabError, match=r"strip\.png.*405 x 100 pixels, too wide.*at most 4 times"):
+        later.require_room(np.zeros((100, 405, 3)), "strip.png")
+    LaterStages.of(("analysis",), "draft", 0, 100, None).require_room(np.zeros((100, 9000, 3)), "strip.png")
 
 
 def test_missing_weights_are_said_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
