@@ -12,7 +12,9 @@ from small_network import small_net
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, YarnParameters, weave_from_name
 from usdfab.fabric.sampling import sample_fabric
-from usdfab.fit import features, raster_stage, stages as fit_stages
+from usdfab.fit import features, raster_evaluation, raster_stage, stages as fit_stages, weights_file
+from usdfab.fit.later_stages import LaterStages
+from usdfab.fit.pipeline import fit_photo
 from usdfab.fit.raster.unconstrained import parameters_of
 from usdfab.fit.raster_evaluation import (
     JUDGED,
@@ -37,7 +39,8 @@ CLOTH = FabricParameters(weave_from_name("plain"), (2e-3, 2e-3), YARN, YARN)
 def quick_features(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     net = small_net(tmp_path, features.fast_dtype())
     monkeypatch.setattr(features, "load_features", lambda *_, **__: net)
-    monkeypatch.setattr(raster_stage, "load_features", lambda *_, **__: net)
+    for module in (raster_stage, raster_evaluation):
+        monkeypatch.setattr(module, "load_features", lambda *_, **__: net)
 
 
 @pytest.mark.parametrize(
@@ -53,6 +56,22 @@ def test_stages_that_cannot_run_are_one_line(stages: tuple[str, ...], line: str)
     with pytest.raises(UsdfabError, match=line):
         checked_stages(stages)
     assert checked_stages(("path", "raster", "analysis")) == ("analysis", "raster", "path")
+
+
+def test_a_photo_with_too_few_rows_is_refused_before_any_work() -> None:
+    later = LaterStages.of(("analysis", "raster"), "draft", 0, 100, None)
+    later.require_room(np.zeros((100, 400, 3)), "strip.png")
+    with pytest.raises(UsdfabError, match=r"strip\.png.*405 x 100 pixels, too wide.*at most 4 times"):
+        later.require_room(np.zeros((100, 405, 3)), "strip.png")
+    LaterStages.of(("analysis",), "draft", 0, 100, None).require_room(np.zeros((100, 9000, 3)), "strip.png")
+
+
+def test_missing_weights_are_said_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(weights_file, "SHIPPED", tmp_path / "gone.safetensors")
+    with pytest.raises(UsdfabError, match=r"gone\.safetensors.*missing"):
+        fit_photo(tmp_path / "no_photo.png", stages=("analysis", "raster"))
+    with pytest.raises(UsdfabError, match="missing"):
+        evaluate_raster(progress=lambda *_: pytest.fail("work has begun"))
 
 
 @pytest.mark.parametrize("closer", [True, False])

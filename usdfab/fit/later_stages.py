@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from numpy.typing import NDArray
 
+from usdfab.errors import UsdfabError
 from usdfab.fabric import SYSTEMS, FabricParameters
 from usdfab.fit.analysis import PhotoAnalysis
 from usdfab.fit.course import Course
@@ -49,6 +51,8 @@ class LaterStages:
         Settings of the stages. None where ``names`` is empty.
     judge:
         How the results of all are judged.
+    widest:
+        Greatest width of a photo, relative to its height, whose pictures have rows enough for the texture statistics.
     rig:
         The photo's, where it is known; None leaves it to the stages to find.
     """
@@ -62,6 +66,7 @@ class LaterStages:
     files: CheckpointFiles | None = None
     rig: Rig | None = None
     judge: StageSettings | None = None
+    widest: float = math.inf
 
     @classmethod
     def of(
@@ -78,19 +83,42 @@ class LaterStages:
         Raises
         ------
         UsdfabError
-            For an unknown quality.
+            For an unknown quality; where the weights of the features, by which all stages are judged, are missing or
+            damaged.
         """
         names = tuple(name for name in wanted if name != "analysis")
         if not names:
             return cls(())
+        from usdfab.fit.features import load_features
         from usdfab.fit.match_stage import checked_match_quality
         from usdfab.fit.path_settings import settings_for
         from usdfab.fit.raster_stage import JUDGE, checked_quality
+        from usdfab.fit.texture import smallest_side
 
+        net = load_features()
         raster = checked_quality(quality)
         # The exposure is found before: the path stage is to leave it as it is.
         path = settings_for(quality, seed=seed, gain=False)  # type: ignore[arg-type]
-        return cls(names, raster, path, checked_match_quality(quality, seed), seed, albedo_paths, files, rig, JUDGE)
+        match = checked_match_quality(quality, seed)
+        looking = (JUDGE, raster) if "raster" in names else (JUDGE,)
+        widest = min(s.width / smallest_side(net, s.levels) for s in looking)
+        return cls(names, raster, path, match, seed, albedo_paths, files, rig, JUDGE, widest)
+
+    def require_room(self, photo: NDArray, place: str) -> None:
+        """Refuse a photo (H, W, 3) so wide that its pictures have too few rows for the texture statistics.
+
+        Raises
+        ------
+        UsdfabError
+            Before any work: else the analysis would be done for nothing.
+        """
+        height, width = photo.shape[:2]
+        if width > self.widest * height:
+            raise UsdfabError(
+                f"the photo has {width} x {height} pixels, too wide for the stages after the analysis",
+                place=place,
+                remedy=f"--crop it to at most {self.widest:.3g} times as wide as high, or use --stages analysis",
+            )
 
     def costs(self) -> dict[str, float]:
         """Seconds that each stage takes, about."""

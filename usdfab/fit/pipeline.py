@@ -116,6 +116,7 @@ def fit_photo(
         photo = replace(load_photo(path, rig.sample_size[0], None, crop), size_source="the rig")
     else:
         photo = load_photo(path, width, pixel_size, crop)
+    later.require_room(photo.pixels, str(path))
     if checkpoint is not None and not resume:
         checkpoint.remove()
     about = {

@@ -18,7 +18,7 @@ from usdfab.errors import UsdfabError
 from usdfab.fabric import SYSTEMS, FabricParameters
 from usdfab.fabric.optics import ROUGHNESSES
 from usdfab.fabric.sampling import sample_fabric
-from usdfab.fit.features import FeatureNet
+from usdfab.fit.features import FeatureNet, fast_dtype, load_features
 from usdfab.fit.path_stage import start_from_joint
 from usdfab.fit.raster.unconstrained import soft_range
 from usdfab.fit.raster_stage import StageResult, StageSettings, refine_by_raster, render_size
@@ -93,6 +93,7 @@ def evaluate_raster(
     """
     if count < 1 or (fibers is not None and fibers < 1):
         raise UsdfabError("there is nothing to fit", place="--count", remedy="use 1 or more fabrics and fibers")
+    net = net or load_features(dtype=fast_dtype())  # before minutes of tracing, if it is missing
     settings = replace(settings or StageSettings(), free=(*JUDGED, "diffuse"))
     jobs = [(weave, number) for weave in weaves for number in range(count)]
     steps, done = len(jobs) * len(ablations) * settings.iterations, 0

@@ -22,6 +22,7 @@ from usdfab.fit.raster.curves import Shapes
 from usdfab.fit.raster.multiple import DiffuseMap
 from usdfab.fit.raster.renderer import RasterRenderer, RasterSettings, raster_renderer
 from usdfab.fit.raster.shade import Look
+from usdfab.fit.raster.shade_kernel import UNSHADOWED
 from usdfab.fit.raster.unconstrained import FREE_NAMES, Parameters, parameters_of
 from usdfab.fit.raster_multiple import measured_diffuse
 from usdfab.fit.straighten import straightened as straightened
@@ -75,7 +76,8 @@ class StageSettings:
         starts 20 % of its range off can come back.
     tied:
         Whether k_d is the multiple scattering that follows from C, measured with the path tracer before the first
-        iteration, see ``raster.multiple``; else it is found like the rest, as in the paper.
+        iteration, see ``raster.multiple``, and as such stands in shadows, too; else it is found like the rest and
+        shadowed like single scattering, as in the paper.
     texture, color, prior:
         Weights of the losses (eq. 11: all 1); 0 leaves one out. ``prior`` is for satin only, see ``losses``; where
         steps are ``newton`` it also holds what the picture does not tell near its start, in units of ``PRIOR_UNIT``.
@@ -196,7 +198,7 @@ def refine_by_raster(
     goal = Target.from_image(picture, net, settings.levels, settings.kind)
     renderer = _renderer(fabric, settings, rig)
     job = fingerprint(fabric, np.asarray(target), np.asarray(diffuse), replace(settings, iterations=0), rig)
-    tie = measured_diffuse(fabric, renderer, rig) if settings.tied and settings.single and settings.diffuse else None
+    tie = measured_diffuse(fabric, renderer, rig) if _diffuse_is_tied(settings) else None
     if diffuse is None:
         diffuse = matching_diffuse(renderer, np.asarray(target).mean(axis=(0, 1)))
     parameters = parameters_of(fabric, diffuse, free=_moving(settings, tie is not None))
@@ -219,6 +221,11 @@ def refine_by_raster(
     return _result(picture_of, state, interrupted)
 
 
+def _diffuse_is_tied(settings: StageSettings) -> bool:
+    """Whether the diffuse term stands for multiple scattering; alone, it stands for all light."""
+    return settings.tied and settings.single and settings.diffuse
+
+
 def _moving(settings: StageSettings, tied: bool) -> tuple[str, ...]:
     without = {"diffuse"} if tied or not settings.diffuse else set()
     if not settings.single:
@@ -233,7 +240,10 @@ def render_size(fabric: FabricParameters, width: int) -> tuple[int, int]:
 
 def _renderer(fabric: FabricParameters, settings: StageSettings, rig: Rig | None = None) -> RasterRenderer:
     size = render_size(fabric, settings.width)
-    raster = RasterSettings(size, settings.supersampling, single=settings.single, diffuse=settings.diffuse)
+    raster = RasterSettings(
+        size, settings.supersampling, single=settings.single, diffuse=settings.diffuse,
+        unshadowed=UNSHADOWED if _diffuse_is_tied(settings) else 0.0,
+    )  # fmt: skip
     return raster_renderer(sample_scene(fabric, rig), raster)
 
 

@@ -13,7 +13,7 @@ from usdfab.fit.raster.jumps import P_ENDS, Q_ENDS, classified
 TILTED = coarse_fabric(fiber_count=20, roughness_azimuthal=0.15, cuticle_tilt=0.05)
 SETTINGS = {
     "all": {"pixels": 16},
-    "tilted": {"pixels": 16, "fabric": TILTED},
+    "tilted": {"pixels": 16, "fabric": TILTED, "unshadowed": 0.4},
     "small": {"pixels": 12, "supersampling": 1, "view": 3.5e-3, "fabric": TILTED},
     "no single": {"pixels": 12, "single": False},
     "no diffuse": {"pixels": 12, "diffuse": False},

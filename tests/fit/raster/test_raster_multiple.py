@@ -9,6 +9,7 @@ import torch
 from usdfab.fabric import FabricParameters, YarnParameters
 from usdfab.fit.raster.multiple import DiffuseMap, crossing_part
 from usdfab.fit.raster.renderer import RasterSettings, raster_renderer
+from usdfab.fit.raster.shade_kernel import UNSHADOWED
 from usdfab.fit.raster_multiple import measured_diffuse
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import swatch_scene
@@ -43,7 +44,7 @@ def test_the_tied_picture_has_the_traced_colours() -> None:
     cloth = FabricParameters(
         size=(2e-3, 2e-3), warp=replace(yarn, albedo=(0.8, 0.4, 0.2)), weft=replace(yarn, albedo=(0.3, 0.6, 0.9))
     )
-    renderer = raster_renderer(swatch_scene(cloth), RasterSettings((32, 32), 2))
+    renderer = raster_renderer(swatch_scene(cloth), RasterSettings((32, 32), 2, unshadowed=UNSHADOWED))
     tie = measured_diffuse(cloth, renderer, paths=20_000)
     look = renderer.look_of()
     look = replace(look, diffuse=tie(look.albedo))

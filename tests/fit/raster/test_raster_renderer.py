@@ -42,6 +42,15 @@ def test_shadows_only_darken():
     lit, dark = (picture(coarse_renderer(16, shadows=s, edges=False), 0.3) for s in (False, True))
     assert (dark <= lit + 1e-12).all()
     assert dark.mean() < 0.995 * lit.mean()
+    # What of the diffuse term is not shadowed is there as without shadows, and single scattering is not touched.
+    part = {"edges": False, "single": False}
+    lit, dark, floor = (
+        picture(coarse_renderer(16, **part, **more), 0.3) for more in ({"shadows": False}, {}, {"unshadowed": 0.4})
+    )
+    np.testing.assert_allclose(floor, 0.4 * lit + 0.6 * dark, rtol=1e-9, atol=1e-15)
+    single = {"edges": False, "diffuse": False}
+    alike = [picture(coarse_renderer(16, **single, unshadowed=u), 0.3) for u in (0.0, 0.4)]
+    np.testing.assert_array_equal(*alike)
 
 
 def test_edges_move_no_light():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from usdfab.fabric import FabricParameters
 from usdfab.fabric.optics import optics_of
 from usdfab.fibers.patch import RASTERIZATION_VERTICES
 from usdfab.fit.raster.curves import CurveModel, Polylines, Shapes, as_numpy, raster_copies
-from usdfab.fit.raster.edges import blended, pixel_pairs
+from usdfab.fit.raster.edges import Jumps, blended, inside, outside, pixel_pairs
 from usdfab.fit.raster.hits import Meeting, meet
 from usdfab.fit.raster.jumps import visible_edges
 from usdfab.fit.raster.segments import geometry_of
@@ -32,8 +32,9 @@ class RasterSettings:
     """How to rasterize.
 
     ``size`` (width, height) of the picture; ``supersampling`` squared pixels make one of them (the paper: 2 x 2).
-    ``single``, ``diffuse``, ``shadows``, ``edges`` switch off parts, for ablations. ``float64`` gives the picture in
-    double precision, in which it is computed, for gradient checks.
+    ``single``, ``diffuse``, ``shadows``, ``edges`` switch off parts, for ablations. ``unshadowed`` of the diffuse term
+    is there in shadows, too; none in the paper, see ``shade_kernel.UNSHADOWED``. ``float64`` gives it in double
+    precision, in which it is computed, for gradient checks.
     """
 
     size: tuple[int, int]
@@ -44,6 +45,7 @@ class RasterSettings:
     diffuse: bool = True
     shadows: bool = True
     edges: bool = True
+    unshadowed: float = 0.0
     float64: bool = False
 
 
@@ -78,7 +80,7 @@ class RasterRenderer:
         self._lighting = Lighting(
             self._view.lamps / scale, self._view.intensity / scale**2,
             cuticle_turns((fabric.warp.cuticle_tilt, fabric.weft.cuticle_tilt), self._color_system),
-            settings.single, settings.diffuse,
+            settings.single, settings.diffuse, settings.unshadowed,
         )  # fmt: skip
 
     def look_of(self, diffuse: float | np.ndarray = 0.3) -> Look:
@@ -106,11 +108,18 @@ class RasterRenderer:
         met = meet(geometry, lines, seen)
         lit = self._lit(lines, met, seen, shadows)
         spread = self._pixel * geometry.scale / lines.radius
-        flat = shaded(geometry, seen, met, lit, spread, materials(look_, self._color_system), self._lighting)
+        material = materials(look_, self._color_system)
+        flat = shaded(geometry, seen, met, lit, spread, material, self._lighting)
         if self.settings.edges:
             parts = []
             for pairs, along_row in zip(self._pairs, (True, False), strict=True):
-                parts += visible_edges(geometry, lines, seen, shadows, pairs, along_row)
+                ends = visible_edges(geometry, lines, seen, pairs, along_row)
+                # What the other pixel sees, as it would look here.
+                at, lit_at = inside(ends.pairs, ends.t), torch.from_numpy(outside(ends.pairs, ends.t))
+                here = replace(geometry, start=geometry.start[at], direction=geometry.direction[at])
+                beyond = meet(here, lines, ends.beyond)
+                light = shaded(here, ends.beyond, beyond, lit[lit_at], spread, material, self._lighting)
+                parts.append(Jumps(ends.pairs, ends.t, light))
             flat = blended(flat, parts)
         return self._view.gain * look_.gain * flat
 
@@ -125,7 +134,7 @@ class RasterRenderer:
                 parts = []
                 for pairs, along_row in zip(self._pairs, (True, False), strict=True):
                     parts += shadow_edges(
-                        self._geometry, lines, met.distance, seen, shadow, lamp, pairs, along_row
+                        self._geometry, lines, met.distance, shines, seen, shadow, lamp, pairs, along_row
                     )  # fmt: skip
                 shines = blended(shines, parts)
             columns.append(shines)

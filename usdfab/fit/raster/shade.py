@@ -54,6 +54,8 @@ class Lighting:
         The cuticle tilts of all colours, of ``tilts``.
     single, diffuse:
         Which parts of the model count.
+    unshadowed:
+        How much of the diffuse term shadows do not take; none in the paper, see ``shade_kernel.UNSHADOWED``.
     """
 
     lamps: Floats
@@ -61,6 +63,7 @@ class Lighting:
     turn: Floats
     single: bool
     diffuse: bool
+    unshadowed: float
 
 
 def materials(look: Look, system: np.ndarray) -> Tensor:
@@ -119,5 +122,5 @@ def _arguments(tensors: tuple[Tensor, ...], geometry: Geometry, seen: Seen, ligh
     return (
         *(np.ascontiguousarray(as_numpy(t)) for t in tensors), geometry.topology, geometry.color, geometry.start,
         geometry.direction, seen.segment, lighting.lamps, lighting.intensity, lighting.turn, lighting.single,
-        lighting.diffuse,
+        lighting.diffuse, lighting.unshadowed,
     )  # fmt: skip
