@@ -29,6 +29,14 @@ def run(
     materialx: Annotated[bool, Parameter(negative="", help="Also wire the maps as MaterialX OpenPBR.")] = False,
     usdz: Annotated[bool, Parameter(negative="", help="Write one .usdz package.")] = False,
     u3m: Annotated[bool, Parameter(negative="", help="Write U3M 1.1: a folder, or a .u3ma file.")] = False,
+    onnx: Annotated[
+        bool, Parameter(negative="", help="Write the neural material's decoders as ONNX graphs instead: a folder.")
+    ] = False,
+    reflection_weights: Annotated[
+        Path | None,
+        Parameter(help="With --onnx: a file of usdfab train neural instead of the shipped or the fabric's own."),
+    ] = None,
+    transmission_weights: Annotated[Path | None, Parameter(help="The same for light from behind the cloth.")] = None,
     meters_per_uv: Annotated[
         str | None,
         Parameter(
@@ -45,6 +53,8 @@ def run(
 ) -> None:
     """Bake a fabric into maps that tile without a seam, and wire them so that any viewer shows the cloth.
 
+    Or, with --onnx, write its neural material as two graphs for engines that run networks (needs the onnx extra).
+
     The folder gets maps/*.png (or .exr), NAME_look.usda, a layer over the fabric's file (which is not changed) in which
     the same Material wears the maps as UsdPreviewSurface, and preview.png.
 
@@ -54,12 +64,30 @@ def run(
         usdfab export denim.usda -o denim --maps albedo,normal,roughness --resolution 2048 --repeats 2x2 --materialx
         usdfab export denim.usda --usdz -o denim.usdz
         usdfab export denim.usda --u3m -o denim.u3ma
+        usdfab export denim.usda --onnx -o denim-onnx
 
     Parameters
     ----------
     fabric:
         A USD file that holds a fabric.
     """
+    if onnx:
+        from usdfab.cli.export_onnx import OnnxOptions, export_onnx
+
+        maps_alone = {
+            "--maps": maps, "--usdz": usdz, "--u3m": u3m, "--materialx": materialx, "--screenshot": screenshot,
+            "--rays": rays, "--back": back, "--meters-per-uv": meters_per_uv,
+        }  # fmt: skip
+        wrong = next((name for name, value in maps_alone.items() if value is not None and value is not False), None)
+        if wrong is not None:
+            raise UsdfabError("does not go with --onnx", place=wrong, remedy="run the command twice")
+        weights = (reflection_weights, transmission_weights)
+        export_onnx(OnnxOptions(fabric, output, prim, *weights, overwrite, json, quiet))
+        return
+    if reflection_weights is not None or transmission_weights is not None:
+        raise UsdfabError(
+            "is for --onnx", place="--reflection-weights" if reflection_weights else "--transmission-weights"
+        )
     from usdfab.cli.export_files import ExportOptions, export, kind_of
     from usdfab.fabric.fabric import parse_length
     from usdfab.tracer.bake import BakeSettings

@@ -21,7 +21,7 @@ from usdfab.neural.lean_network import FEATURES, TEXELS, LeanNetwork
 from usdfab.neural.network import KINDS
 
 FORMAT = "usdfab-neural-asset/1"
-INTERFACE = f"query 8; {' '.join(COLUMNS)}; codes {TEXELS}x{FEATURES}"
+INTERFACE = f"query 8; g({') g('.join(COLUMNS)}); codes {TEXELS}x{FEATURES}"
 """What numbers in and out mean: files that say something else cannot be used."""
 
 NOT_SEEN = ("name", "provenance", "albedo_map", "neural_weights")

@@ -2,9 +2,9 @@
 
 There is no encoder: pyramids are learned as they are, one for each side of the cloth. Answers are colours, since the
 fabric's are fixed: what fibers do to white light is not a product of an albedo and a number, it is deeper in colour
-the more fibers light went through. Columns (``COLUMNS``): red, green, gloss, blue. The first two come straight
-from the last layer, the others through g^-1, as the four components of the shared networks do, so that the same decoder
-code reads both; gloss is light that was only mirrored and has no colour, which prints therefore do not colour.
+the more fibers light went through. Columns (``COLUMNS``): red, green, gloss, blue, all through g^-1 from the last
+layer, so that dark answers keep their hue; gloss is light that was only mirrored and has no colour, which prints
+therefore do not colour.
 """
 
 from __future__ import annotations
@@ -57,6 +57,7 @@ class AssetNetwork(nn.Module):
         self.kind = kind
         # The encoder stays out: only what is asked at run time is learned and kept.
         self.lean = LeanNetwork(kind, decoder.width, channels=1)
+        self.lean.linear = 0
         for name in DECODER:
             self.layer(name).load_state_dict(getattr(decoder, name).state_dict())
         for name, parameter in self.lean.named_parameters():
@@ -81,8 +82,7 @@ class AssetNetwork(nn.Module):
 
     def forward(self, queries: Tensor) -> Tensor:
         """Columns (SIDES, Q, 4) of queries (SIDES, Q, 8); they may be a little below 0."""
-        outputs = self.lean.decode(self.codes, queries)
-        return torch.cat([outputs[..., :2], torch.expm1(outputs[..., 2:]) / self.curvature], dim=-1)
+        return self.lean.expanded(self.lean.decode(self.codes, queries))
 
     def plans(self) -> list[Plan]:
         """Ready to be asked: the front, the back."""

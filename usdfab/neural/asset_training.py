@@ -36,7 +36,7 @@ from usdfab.neural.rendered_material import learned_material, reversed_material
 from usdfab.neural.surface_from_fabric import surface_from_fabric
 from usdfab.torch_run import deterministic, one_thread
 
-FLOOR = 1.0
+FLOOR = 0.25
 """Of the weights of squares, in means of a column: what is darker counts no more."""
 
 GLOSS_WEIGHT = 0.25
@@ -59,11 +59,11 @@ class AssetSettings:
         Adam's, at the start; they fall as a cosine.
     """
 
-    queries: int = 40_000
-    samples: int = 16
+    queries: int = 100_000
+    samples: int = 20
     epochs: int = 5
-    batch: int = 8192
-    code_rate: float = 1e-2
+    batch: int = 2048
+    code_rate: float = 1e-3
     decoder_rate: float = 1e-2
     seed: int = 0
 
@@ -78,7 +78,7 @@ class AssetSettings:
 QUALITIES = {
     "draft": AssetSettings(queries=8_000, samples=8, epochs=8),
     "standard": AssetSettings(),
-    "high": AssetSettings(queries=160_000, samples=24, epochs=6),
+    "high": AssetSettings(queries=400_000, samples=24, epochs=6),
 }
 """By the names of ``--quality``."""
 
@@ -166,8 +166,6 @@ def prepare_outputs(network: AssetNetwork, answers: NDArray[np.float32]) -> None
         for row, column in enumerate(COLUMNS):
             if column == "gloss":
                 last.weight[row], last.bias[row] = gloss, bias_g
-            elif row < 2:
-                last.weight[row], last.bias[row] = 5.0 * mean[row] * diffuse, 5.0 * mean[row] * bias_c
             else:
                 last.weight[row] = 5.0 * slope[row] * diffuse
                 last.bias[row] = torch.log1p(network.curvature * mean[row]) + slope[row] * (5.0 * bias_c - 1.0)

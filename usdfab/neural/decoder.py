@@ -40,6 +40,8 @@ class Plan:
         The pyramid of the lean network; empty for the paper's, whose latent is in the first biases.
     rows, angle_row:
         Of a block's array; where the paper's directions are.
+    linear:
+        How many of the four results are taken as they are; the others go through g^-1.
     """
 
     architecture: int
@@ -49,6 +51,7 @@ class Plan:
     code: Floats
     rows: int
     angle_row: int
+    linear: int
     curvature: float
 
     @property
@@ -80,7 +83,7 @@ class Plan:
         """Components of some queries in columns (8 ``stride``,) flat: those of ``order`` (N,), into ``out`` (N, 4)."""
         decode_range(
             self.architecture, self.layers, self.weights, self.biases, self.code.reshape(-1), self.rows,
-            self.angle_row, self.curvature, queries, stride, order, 0, len(order), out,
+            self.angle_row, self.linear, self.curvature, queries, stride, order, 0, len(order), out,
         )  # fmt: skip
 
 
@@ -109,12 +112,12 @@ def pack_plans(plans: Sequence[Plan]) -> Decoders:
     """Plans one after the other, for kernels that ask several."""
     if not plans:
         nothing = np.zeros(4, dtype=np.float32)
-        plans = [Plan(LEAN, np.zeros((1, 8), dtype=np.int64), nothing, nothing, nothing, 4, 0, 1.0)]
+        plans = [Plan(LEAN, np.zeros((1, 8), dtype=np.int64), nothing, nothing, nothing, 4, 0, 2, 1.0)]
     table, layers = [], []
     ends = [0, 0, 0, 0]
     for plan in plans:
         sizes = (len(plan.layers), plan.code.size, plan.weights.size, plan.biases.size)
-        table.append([plan.architecture, ends[0], ends[0] + sizes[0], plan.rows, plan.angle_row, ends[1]])
+        table.append([plan.architecture, ends[0], ends[0] + sizes[0], plan.rows, plan.angle_row, ends[1], plan.linear])
         moved = plan.layers.copy()
         moved[:, WEIGHTS] += ends[2]
         moved[:, BIASES] += ends[3]
@@ -147,10 +150,12 @@ class _Builder:
         self.weights.append(matrix.reshape(-1, 4, matrix.shape[1]).transpose(0, 2, 1).ravel())
         self.biases.append(layer.bias.detach().numpy().astype(np.float32) if bias is None else bias)
 
-    def plan(self, architecture: int, code: Floats, rows: int, angle_row: int, curvature: float) -> Plan:
+    def plan(self, architecture: int, code: Floats, rows: int, angle_row: int, network: MaterialNetwork) -> Plan:
         table = np.array(self.rows, dtype=np.int64)
         weights, biases = np.concatenate(self.weights), np.concatenate(self.biases)
-        return Plan(architecture, table, weights, biases, code, rows, angle_row, curvature)
+        return Plan(
+            architecture, table, weights, biases, code, rows, angle_row, network.linear, network.curvature,
+        )  # fmt: skip
 
 
 def _lean_plan(network: LeanNetwork, code: Tensor) -> Plan:
@@ -162,7 +167,7 @@ def _lean_plan(network: LeanNetwork, code: Tensor) -> Plan:
     builder.add(two, one, network.third, add=True)
     builder.add(one, out, network.last, activate=False)
     pyramid = np.ascontiguousarray(code.detach().numpy(), dtype=np.float32)
-    return builder.plan(LEAN, pyramid, out + 4, FEATURES, network.curvature)
+    return builder.plan(LEAN, pyramid, out + 4, FEATURES, network)
 
 
 def _paper_plan(network: PaperNetwork, code: Tensor) -> Plan:
@@ -179,4 +184,4 @@ def _paper_plan(network: PaperNetwork, code: Tensor) -> Plan:
     builder.add(224, 160, block.second, add=True)
     builder.add(160, 224, network.angular_hidden)
     builder.add(224, 288, network.angular_out, activate=False)
-    return builder.plan(PAPER, np.zeros((1, FEATURES), dtype=np.float32), 292, 152, network.curvature)
+    return builder.plan(PAPER, np.zeros((1, FEATURES), dtype=np.float32), 292, 152, network)

@@ -164,12 +164,28 @@ def _paper_inputs(x, half, angle_row, u, v, size, ix, iy, iz, ox, oy):
 
 @njit(**OPTIONS)
 def decode_range(
-    architecture, layers, weights, biases, code, rows, angle_row, curvature, queries, stride, order, first, last, out
+    architecture,
+    layers,
+    weights,
+    biases,
+    code,
+    rows,
+    angle_row,
+    linear,
+    curvature,
+    queries,
+    stride,
+    order,
+    first,
+    last,
+    out,
 ):
     """Components of queries ``order[first:last]`` into rows ``first`` to ``last`` of ``out`` (N, 4) float32, none < 0.
 
     Parameters
     ----------
+    linear:
+        How many of the four results are taken as they are; the others go through g^-1.
     queries: (8 stride,) float32
         In columns.
     order: (N,) int32
@@ -200,9 +216,10 @@ def decode_range(
                 x, weights, biases, layers[n, IN_ROW], layers[n, INPUTS], layers[n, OUT_ROW], layers[n, OUTPUTS],
                 layers[n, WEIGHTS], layers[n, BIASES], layers[n, ADD] != 0, layers[n, ACTIVATE] != 0,
             )  # fmt: skip
-        for r in range(result, result + 2 * BLOCK, LANES):
+        compressed = result + linear * BLOCK
+        for r in range(result, compressed, LANES):
             store(x, r, most(load(x, r), 0.0))
-        for r in range(result + 2 * BLOCK, result + 4 * BLOCK, LANES):
+        for r in range(compressed, result + 4 * BLOCK, LANES):
             value = load(x, r)
             store(x, r, where(value > 0.0, (exp(value) - 1.0) * scale, 0.0))
         for k in range(count):

@@ -27,10 +27,12 @@ SLOPE = 0.01
 class MaterialNetwork(nn.Module):
     """An encoder of materials and a decoder of queries. Sub-classes differ in what the code between them is.
 
-    ``kind`` is one of ``KINDS``; outputs are (C_warp, C_weft, g(S_warp), g(S_weft)) with the kind's g.
+    ``kind`` is one of ``KINDS``; outputs are (C_warp, C_weft, g(S_warp), g(S_weft)) with the kind's g: the first
+    ``linear`` as they are.
     """
 
     architecture = ""
+    linear = 2
 
     def __init__(self, kind: str) -> None:
         super().__init__()
@@ -51,8 +53,12 @@ class MaterialNetwork(nn.Module):
 
     def components(self, outputs: Tensor) -> Tensor:
         """C_warp, C_weft, S_warp, S_weft (..., 4) of outputs (..., 4); none below 0."""
-        specular = torch.expm1(outputs[..., 2:]) / self.curvature
-        return torch.cat([outputs[..., :2], specular], dim=-1).clamp(min=0.0)
+        return self.expanded(outputs).clamp(min=0.0)
+
+    def expanded(self, outputs: Tensor) -> Tensor:
+        """The same, maybe a little below 0."""
+        specular = torch.expm1(outputs[..., self.linear :]) / self.curvature
+        return torch.cat([outputs[..., : self.linear], specular], dim=-1)
 
     def forward(self, tiles: Tensor, parameters: Tensor, queries: Tensor) -> Tensor:
         """C_warp, C_weft, S_warp, S_weft (M, Q, 4)."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
+from usdfab.fabric import FabricParameters
 from usdfab.neural.asset_file import fabric_digest, load_asset_network
 from usdfab.neural.asset_network import TINTED, AssetMaterial
 from usdfab.neural.cloth_scene import has_bodies, pack_cloth
@@ -175,16 +176,27 @@ def _dress(scene: Scene, assets: Mapping[int, AssetMaterial]) -> _Dress:
             albedo[number], tinted[number], crossings[number] = assets[number].albedo, TINTED, assets[number].tile
             continue
         crossings[number] = surface.fabric.weave.ends, surface.fabric.weave.picks
-        cloth, colors = surface_from_fabric(surface.fabric)
-        cloth, cover = learned_material(cloth)
-        if max(cloth.rows, cloth.columns) > LARGEST_REPEAT:
-            raise UsdfabError(
-                f"a weave of {cloth.columns} ends and {cloth.rows} picks is larger than the encoder takes "
-                f"({LARGEST_REPEAT})", place=surface.path, remedy="use --backend embree",
-            )  # fmt: skip
-        materials += [cloth, reversed_material(cloth)]
-        albedo[number] = cover * np.stack([colors.reflection, colors.transmission])
+        sides, albedo[number] = shared_dress(surface.fabric, surface.path)
+        materials += sides
     return _Dress(materials, albedo.astype(np.float32), tinted.astype(np.float32), crossings, assets)
+
+
+def shared_dress(fabric: FabricParameters, place: str) -> tuple[list[SurfaceMaterial], NDArray[np.float64]]:
+    """Front and back of a fabric as the shared networks know them, and the albedos (2, 4, 3) of their components.
+
+    Raises
+    ------
+    UsdfabError
+        If the weave is larger than the encoder takes.
+    """
+    cloth, colors = surface_from_fabric(fabric)
+    cloth, cover = learned_material(cloth)
+    if max(cloth.rows, cloth.columns) > LARGEST_REPEAT:
+        raise UsdfabError(
+            f"a weave of {cloth.columns} ends and {cloth.rows} picks is larger than the encoder takes "
+            f"({LARGEST_REPEAT})", place=place, remedy="use --backend embree",
+        )  # fmt: skip
+    return [cloth, reversed_material(cloth)], cover * np.stack([colors.reflection, colors.transmission])
 
 
 def dressed(ready: NeuralScene, scene: Scene, networks: Mapping[str, Weights]) -> NeuralScene:

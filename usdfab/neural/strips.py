@@ -22,8 +22,9 @@ class Decoders(NamedTuple):
 
     Parameters
     ----------
-    table: (materials, 6) int64
-        Architecture, first and last row in ``layers``, rows of a block, row of the directions, first of ``codes``.
+    table: (materials, 7) int64
+        Architecture, first and last row in ``layers``, rows of a block, row of the directions, first of ``codes``, how
+        many results are taken as they are.
     curvatures: (materials,)
     layers, weights, biases, codes:
         See ``decoder.Plan``; places in ``weights`` and ``biases`` count from their start here.
@@ -68,7 +69,7 @@ def decode_group(decoders, number, queries, stride, order, first, last, out):
     row = decoders.table[number]
     decode_range(
         row[0], decoders.layers[row[1] : row[2]], decoders.weights, decoders.biases, decoders.codes[row[5] :], row[3],
-        row[4], decoders.curvatures[number], queries, stride, order, first, last, out,
+        row[4], row[6], decoders.curvatures[number], queries, stride, order, first, last, out,
     )  # fmt: skip
 
 
