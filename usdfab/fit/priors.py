@@ -84,15 +84,15 @@ def assumed_notes(analysis: PhotoAnalysis, start: FabricParameters, fabric: Fabr
         What ``fabric_from_analysis`` made of the analysis, and what became of it.
     """
 
-    def stays(name: str, systems: tuple[str, ...] = ("warp", "weft")) -> bool:
-        return all(getattr(start.system(s), name) == getattr(fabric.system(s), name) for s in systems)
+    def stays(name: str, system: str) -> bool:
+        return bool(getattr(getattr(start, system), name) == getattr(getattr(fabric, system), name))
 
     notes = [
         f"twist of the {system} is a prior"
         for system in ("warp", "weft")
-        if getattr(analysis, system).twist_confidence < MIN_CONFIDENCE and stays("twist", (system,))
+        if getattr(analysis, system).twist_confidence < MIN_CONFIDENCE and stays("twist", system)
     ]
-    names = [name.replace("_", " ") for name in ASSUMED if stays(name)]
+    names = [name.replace("_", " ") for name in ASSUMED if stays(name, "warp") and stays(name, "weft")]
     if names:
         notes.append(f"{', '.join(names)}: not estimated, typical values")
     return tuple(notes)
