@@ -30,7 +30,7 @@ def test_the_shipped_network_is_the_one_on_its_card(shipped: Weights) -> None:
     card = network_file.SHIPPED.with_suffix(".md").read_text(encoding="utf-8")
     data = shipped.about["data"]
     assert digest in card and isinstance(shipped.network, Robust)
-    for said in (f"{data['training_samples']} rendered", f"{data['drawn']} drawn", f"{data['spp']} samples per pixel"):
+    for said in (f"{data['training_samples']} rendered", f"{data['drawn']} drawn", f"{data['spp']} sample"):
         assert said in card
     assert network_file.SHIPPED.stat().st_size < 3e6
 
