@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from usdfab.fit.raster.curves import CurveModel, Polylines
-from usdfab.fit.raster.edges import Pairs, inside, outside
+from usdfab.fit.raster.edges import Pairs
 from usdfab.fit.raster.renderer import RasterRenderer
 from usdfab.fit.raster.visibility import NOTHING, Seen, index_patch, look
 from usdfab.scattering.fiber_torch import eval_fiber, pack_fiber
@@ -166,14 +166,20 @@ class Reference:
         kinds[rows] = np.where(row >= column if along_row else row > column, np.where(a_ends, 1, 2), 0)
         return kinds
 
-    def visible_edges(self, pairs: Pairs, along_row: bool) -> tuple[Pairs, Tensor]:
+    def visible_edges(self, pairs: Pairs, along_row: bool) -> tuple[Pairs, Tensor, np.ndarray, np.ndarray]:
         kinds = self.classified(pairs, along_row)
         pairs, kinds = pairs[kinds > 0], kinds[kinds > 0]
         ends, other = np.where(kinds == 1, pairs.p, pairs.q), np.where(kinds == 1, pairs.q, pairs.p)
         t = crossing(*(self.showing(ends, other, at) for at in (pairs.p, pairs.q)))
-        return pairs, t
+        smooth = []
+        for near, far in ((pairs.p, pairs.before), (pairs.q, pairs.after)):
+            alike = (near != far) & ~self.jumps(near, far)
+            for shadow in self.shadows:
+                alike &= (shadow.segment[near] != NOTHING) == (shadow.segment[far] != NOTHING)
+            smooth.append(alike)
+        return pairs, t, smooth[0], smooth[1]
 
-    def shadow_edges(self, shadow: Seen, shines, distance: Tensor, lamp: np.ndarray, pairs: Pairs, along_row: bool):
+    def shadow_edges(self, shadow: Seen, distance: Tensor, lamp: np.ndarray, pairs: Pairs, along_row: bool):
         dark, seen = shadow.segment != NOTHING, self.seen.segment != NOTHING
         pairs = pairs[(dark[pairs.p] != dark[pairs.q]) & seen[pairs.p] & ~self.jumps(pairs.p, pairs.q)]
         owner, lit = np.where(dark[pairs.p], pairs.p, pairs.q), np.where(dark[pairs.p], pairs.q, pairs.p)
@@ -195,8 +201,8 @@ class Reference:
             keep = (row >= column if along_row else row > column).numpy() & (same | along_row)
             sign = torch.sign(cast(lit))[torch.from_numpy(keep)]
         pairs, owner = pairs[keep], owner[keep]
-        t = crossing(sign * cast(pairs.p) - 1.0, sign * cast(pairs.q) - 1.0)
-        return pairs, t, shines[torch.from_numpy(outside(pairs, t))]
+        flat = np.zeros(len(pairs.p), dtype=bool)
+        return pairs, crossing(sign * cast(pairs.p) - 1.0, sign * cast(pairs.q) - 1.0), flat, flat
 
     def image(self, look_) -> Tensor:
         """(H, W, 3)"""
@@ -204,56 +210,38 @@ class Reference:
         view, n = renderer._view, len(self.directions)
         hit = np.flatnonzero(self.seen.segment != NOTHING)
         rows = torch.from_numpy(hit)
-        s = self.segments(self.seen.segment[hit].astype(np.int64), self.seen.copy[hit], self.starts(hit))
-        met = meet(s, self.directions[rows])
-        far = torch.zeros(n, dtype=torch.float64).index_copy(0, rows, met[0])
-        lit = []
+        segment = self.seen.segment[hit].astype(np.int64)
+        s = self.segments(segment, self.seen.copy[hit], self.starts(hit))
+        distance, tangent, h = meet(s, self.directions[rows])
+        far = torch.zeros(n, dtype=torch.float64).index_copy(0, rows, distance)
+        spread = renderer._pixel / s.radius
+        flat = torch.zeros(n, 3, dtype=torch.float64)
         for k, lamp in enumerate(view.lamps):
-            shines = torch.ones(n, 1, dtype=torch.float64)
+            lit = torch.ones(len(hit), dtype=torch.float64)
             if settings.shadows:
                 shines = torch.from_numpy((self.shadows[k].segment == NOTHING).astype(float))[:, None]
                 if settings.edges:
                     parts = [
-                        self.shadow_edges(self.shadows[k], shines, far, lamp, pairs, along_row)
+                        self.shadow_edges(self.shadows[k], far, lamp, pairs, along_row)
                         for pairs, along_row in zip(renderer._pairs, (True, False), strict=True)
                     ]
                     shines = blended(shines, parts)
-            lit.append(shines[:, 0])
-        flat = torch.zeros(n, 3, dtype=torch.float64).index_add(
-            0, rows, self._light(look_, self.seen.segment[hit], hit, *met, [x[rows] for x in lit])
-        )
+                lit = shines[rows, 0]
+            to_lamp = (
+                torch.from_numpy((lamp - self.starts(hit)) / self.scale) - distance[:, None] * self.directions[rows]
+            )
+            intensity = torch.from_numpy(view.intensity[k] / self.scale**2)
+            rest = settings.unshadowed
+            for part, shines in (("single", lit), ("diffuse", rest + (1.0 - rest) * lit)):
+                if getattr(settings, part):
+                    light = self._shaded(part, look_, segment, tangent, h, self.directions[rows], spread, to_lamp)
+                    flat = flat.index_add(0, rows, light * shines[:, None] * intensity)
         if settings.edges:
-            parts = []
-            for pairs, along_row in zip(renderer._pairs, (True, False), strict=True):
-                pairs, t = self.visible_edges(pairs, along_row)
-                aside, here = outside(pairs, t), inside(pairs, t)
-                solid = np.flatnonzero(self.seen.segment[aside] != NOTHING)
-                aside, here = aside[solid], here[solid]
-                direction = self.directions[torch.from_numpy(here)]
-                met = meet(self.beside(self.seen, aside, self.starts(here), direction), direction)
-                lit_aside = [x[torch.from_numpy(aside)] for x in lit]
-                light = self._light(look_, self.seen.segment[aside], here, *met, lit_aside)
-                beyond = torch.zeros(len(t), 3, dtype=torch.float64)
-                parts.append((pairs, t, beyond.index_add(0, torch.from_numpy(solid), light)))
+            parts = [self.visible_edges(pairs, row) for pairs, row in zip(renderer._pairs, (True, False), strict=True)]
             flat = blended(flat, parts)
         height, width = renderer._shape
         m = settings.supersampling
         return view.gain * look_.gain * flat.reshape(height // m, m, width // m, m, 3).mean(dim=(1, 3))
-
-    def _light(self, look_, segment, pixels, distance: Tensor, tangent: Tensor, h: Tensor, lit: list[Tensor]):
-        """(M, 3) of all lamps on segments (M,) seen by ``pixels`` (M,)."""
-        view, segment = self.renderer._view, segment.astype(np.int64)
-        direction = self.directions[torch.from_numpy(pixels)]
-        spread = self.renderer._pixel * self.scale / self.lines.radius[torch.from_numpy(self.model.system[segment])]
-        total = torch.zeros(len(pixels), 3, dtype=torch.float64)
-        for k, lamp in enumerate(view.lamps):
-            to_lamp = torch.from_numpy((lamp - self.starts(pixels)) / self.scale) - distance[:, None] * direction
-            settings, rest = self.renderer.settings, self.renderer.settings.unshadowed
-            for part, shines in (("single", lit[k]), ("diffuse", rest + (1.0 - rest) * lit[k])):
-                if getattr(settings, part):
-                    light = self._shaded(part, look_, segment, tangent, h, direction, spread, to_lamp)
-                    total = total + light * shines[:, None] * torch.from_numpy(view.intensity[k] / self.scale**2)
-        return total
 
     def _shaded(self, part: str, look_, segment, tangent, h, ray, spread, offset) -> Tensor:
         """Single scattering or diffuse light of pieces of equal angle, over the squared distance."""
@@ -311,7 +299,14 @@ def crossing(at_p: Tensor, at_q: Tensor) -> Tensor:
 
 def blended(values: Tensor, parts) -> Tensor:
     result = values
-    for pairs, t, beyond in parts:
-        target = torch.where(t < 0.5, torch.from_numpy(pairs.p), torch.from_numpy(pairs.q))
-        result = result.index_add(0, target, (0.5 - t).abs()[:, None] * (beyond - values[target]))
+    for pairs, t, smooth_p, smooth_q in parts:
+        p, q = torch.from_numpy(pairs.p), torch.from_numpy(pairs.q)
+        slope_p = torch.from_numpy(smooth_p)[:, None] * (values[p] - values[torch.from_numpy(pairs.before)])
+        slope_q = torch.from_numpy(smooth_q)[:, None] * (values[torch.from_numpy(pairs.after)] - values[q])
+        slope_p, slope_q = torch.maximum(slope_p, -values[p]), torch.minimum(slope_q, values[q])
+        width = (0.5 - t)[:, None]
+        at_p = values[q] - slope_q - values[p]
+        moved = width * (at_p + (slope_q - slope_p) * (0.5 * (t + 0.5))[:, None])
+        towards_p = (width > 0.0) * moved
+        result = result.index_add(0, p, towards_p).index_add(0, q, moved - towards_p)
     return result

@@ -1,5 +1,6 @@
 """Small fabrics of few, thick fibers, so that a picture of some pixels shows each of them."""
 
+import numpy as np
 import torch
 
 from usdfab.fabric import FabricParameters, YarnParameters
@@ -38,13 +39,18 @@ def leaves(renderer: RasterRenderer, diffuse: float = 0.3):
     return shapes, look, named
 
 
-def slope(function, tensor: torch.Tensor, entry: tuple, step: float) -> float:
-    """Derivative of ``function()`` by an entry of ``tensor``, good to the fourth order."""
+def slope(function, tensor: torch.Tensor, entry: tuple, step: float, points: int = 7) -> tuple[float, float]:
+    """Derivative of ``function()`` by an entry of ``tensor`` from a cubic through several points, and its error."""
+    offsets = np.linspace(-1.0, 1.0, points)
     with torch.no_grad():
         start = tensor[entry].clone()
         values = []
-        for offset in (-2.0, -1.0, 1.0, 2.0):
+        for offset in offsets:
             tensor[entry] = start + offset * step
             values.append(float(function()))
         tensor[entry] = start
-    return (values[0] - 8.0 * values[1] + 8.0 * values[2] - values[3]) / (12.0 * step)
+    matrix = np.vander(offsets, 4)
+    fit = np.linalg.lstsq(matrix, np.array(values), rcond=None)[0]
+    rest = np.array(values) - matrix @ fit
+    spread = np.linalg.inv(matrix.T @ matrix)[2, 2] * (rest @ rest) / (points - 4)
+    return fit[2] / step, float(np.sqrt(spread)) / step

@@ -1,8 +1,7 @@
 """Gradients of a rendered loss against finite differences.
 
-A picture of pixels is not smooth: where two or more jumps fall into one pixel it jumps itself, and its gradient varies
-from place to place. So the mean of gradients along a way is held against the loss's difference over it, which it is the
-integral of; how much they differ from one stretch of the way to the next tells whether the difference is resolved.
+A picture of pixels is not smooth: where two or more jumps fall into one pixel it jumps itself, and finite differences
+are noisy. So they are fitted through several points; the noise of the fit tells whether they are resolved.
 """
 
 import numpy as np
@@ -31,103 +30,84 @@ def setting(pixels: int, **settings):
     return loss, named
 
 
-def along(loss, named, name: str, part: float = 0.06, stretches: int = 12):
-    """(mean gradient, finite difference, its standard error) over ``part`` of the value each way."""
+def compared(loss, named, name: str, entry: tuple = (), part: float = 0.02, points: int = 7):
+    """(gradient, finite difference over ``part`` of the value each way from ``points``, its standard error)."""
     tensor = named[name]
-    start = tensor.detach().clone()
-    value = abs(float(start))
+    value = abs(float(tensor.detach()[entry]))
     step = part * (value if name.endswith("radius") else max(value, 0.05))
-    borders = np.linspace(-step, step, stretches + 1)
-    losses, gradients = [], []
-    for offset in borders:
-        with torch.no_grad():
-            tensor.copy_(start + offset)
-            losses.append(float(loss()))
-    for offset in 0.5 * (borders[1:] + borders[:-1]):
-        with torch.no_grad():
-            tensor.copy_(start + offset)
-        tensor.grad = None
-        loss().backward()
-        gradients.append(float(tensor.grad))
-    with torch.no_grad():
-        tensor.copy_(start)
-    differences = np.diff(losses) / np.diff(borders)
-    error = np.std(np.array(gradients) - differences, ddof=1) / np.sqrt(stretches)
-    return float(np.mean(gradients)), float(differences.mean()), float(error)
+    difference, error = slope(loss, tensor, entry, step, points)
+    assert tensor.grad is not None
+    return float(tensor.grad[entry]), difference, error
 
 
 def test_gradients_of_the_shape():
-    loss, named = setting(32, supersampling=4, shadows=False)
+    loss, named = setting(32, supersampling=4, single=False, shadows=False)
+    loss().backward()
     resolved = []
-    for name in ("weft.radius", "weft.inclination", "warp.crimp", "weft.flattening"):
-        gradient, difference, error = along(loss, named, name, stretches=8)
+    for name in ("warp.radius", "weft.inclination", "warp.crimp", "weft.flattening", "warp.irregularity", "warp.twist"):
+        gradient, difference, error = compared(loss, named, name)
         if error < RESOLVED * abs(difference):
             resolved.append(name)
             assert gradient == pytest.approx(difference, rel=0.1), name
     assert len(resolved) >= 3, resolved
 
 
-def compared(loss, named, name: str, entry: tuple) -> tuple[float, float]:
-    """Gradient and finite difference of what the picture is smooth in."""
-    tensor = named[name]
-    return float(tensor.grad[entry]), slope(loss, tensor, entry, 0.02 * max(abs(float(tensor.detach()[entry])), 0.05))
-
-
 def test_gradients_of_the_optics():
     loss, named = setting(16)
     loss().backward()
     for name, entry in OPTICS.items():
-        gradient, difference = compared(loss, named, name, entry)
+        gradient, difference, _ = compared(loss, named, name, entry)
         assert gradient == pytest.approx(difference, rel=2e-3), name
     for column in (1, 2):
-        gradient, difference = compared(loss, named, "roughness", (1, column))
+        gradient, difference, _ = compared(loss, named, "roughness", (1, column))
         assert gradient == pytest.approx(difference, rel=2e-3), column
 
 
 def test_without_edges_the_gradient_is_wrong():
-    loss, named = setting(32, supersampling=4, single=False, shadows=False)
-    gradient, difference, error = along(loss, named, "weft.radius")
+    with_edges, named = setting(32, supersampling=4, single=False, shadows=False)
+    without, other = setting(32, supersampling=4, single=False, shadows=False, edges=False)
+    with_edges().backward()
+    without().backward()
+    gradient, difference, error = compared(with_edges, named, "weft.radius")
     assert error < RESOLVED * abs(difference)
     assert gradient == pytest.approx(difference, rel=0.1)
-    loss, named = setting(32, supersampling=4, single=False, shadows=False, edges=False)
-    assert abs(along(loss, named, "weft.radius", stretches=3)[0] - difference) > 0.5 * abs(difference)
-
-
-SHAPE = tuple(
-    f"{system}.{k}"
-    for system in ("warp", "weft")
-    for k in ("radius", "flattening", "inclination", "crimp", "twist", "irregularity")
-)
-THICKNESS = ("weft.radius", "weft.flattening")
+    assert abs(float(other["weft.radius"].grad) - difference) > 0.5 * abs(difference)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("shadows", "names"),
+    ("shadows", "part", "points"),
     [
-        (False, SHAPE),
-        (True, tuple(name for name in SHAPE if name not in THICKNESS)),
+        (False, 0.02, 7),
+        # Rims of shadows jump together over some pixels: over .02 the differences vary by 15 % from one resolution to
+        # the next, far more than the fit's error tells.
+        (True, 0.06, 13),
         pytest.param(
-            True,
-            THICKNESS,
+            True, 0.02, 7,
+            marks=pytest.mark.xfail(reason="the warp's inclination is 16 % off these short differences", strict=True),
+        ),
+        pytest.param(
+            False, 0.06, 13,
             marks=pytest.mark.xfail(
-                reason="12 to 15 % too small: light that comes out between a shadow and the fiber's own silhouette",
+                reason="the weft's radius is 20 %, its flattening 14 % off: single scattering at silhouettes",
                 strict=True,
             ),
         ),
     ],
-)
-def test_gradients_of_everything(shadows, names):
+)  # fmt: skip
+def test_gradients_of_everything(shadows, part, points):
     loss, named = setting(48, supersampling=4, shadows=shadows)
-    report, wrong, resolved = {}, [], []
-    for name in names:
-        gradient, difference, error = report[name] = along(loss, named, name)
+    loss().backward()
+    report, wrong = {}, []
+    shape = ("radius", "flattening", "inclination", "crimp", "twist", "irregularity")
+    for name in [f"{system}.{k}" for system in ("warp", "weft") for k in shape]:
+        gradient, difference, error = compared(loss, named, name, part=part, points=points)
+        report[name] = (gradient, difference, error)
         if abs(difference) > 3.0 * error and gradient * difference <= 0.0:
             wrong.append(name)
-        if error < RESOLVED * abs(difference):
-            resolved.append(name)
-            if abs(gradient - difference) > 0.1 * abs(difference):
-                wrong.append(name)
+        if error < RESOLVED * abs(difference) and abs(gradient - difference) > 0.1 * abs(difference):
+            wrong.append(name)
     print("\n".join(f"{k}: {g:.4g} against {d:.4g} +- {e:.2g}" for k, (g, d, e) in report.items()))
+    resolved = [k for k, (_, d, e) in report.items() if e < RESOLVED * abs(d)]
     assert not wrong
-    assert len(resolved) >= len(names) // 3, resolved
+    assert len(resolved) >= 5, resolved

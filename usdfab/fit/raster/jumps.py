@@ -8,7 +8,7 @@ than (a - d) / radius. So the jump function of the fiber is sqrt(h^2 + max(a - d
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from usdfab.fit.raster.curves import Polylines, as_numpy
-from usdfab.fit.raster.edges import Pairs, crossing, crossing_slopes
+from usdfab.fit.raster.edges import Jumps, Pairs, crossing, crossing_slopes
 from usdfab.fit.raster.hits import in_units
 from usdfab.fit.raster.segments import (
     BLOCK,
@@ -41,17 +41,10 @@ _TINY = 1e-12
 _LEAST_ROOT = 1e-9
 
 
-class Ends(NamedTuple):
-    """Where between pixels one fiber gives way to another: t (M,) as of ``edges.Jumps``; ``beyond`` (M,), what the
-    other pixels see, as the segments of those fibers that lie beside the rays of the pixels with the jumps."""
-
-    pairs: Pairs
-    t: Tensor
-    beyond: Seen
-
-
-def visible_edges(geometry: Geometry, lines: Polylines, seen: Seen, pairs: Pairs, along_row: bool) -> Ends:
-    """Where between pixels one fiber gives way to another.
+def visible_edges(
+    geometry: Geometry, lines: Polylines, seen: Seen, shadows: list[Seen], pairs: Pairs, along_row: bool
+) -> list[Jumps]:
+    """Where between pixels one fiber gives way to another, for ``edges.blended``.
 
     Parameters
     ----------
@@ -61,13 +54,15 @@ def visible_edges(geometry: Geometry, lines: Polylines, seen: Seen, pairs: Pairs
     points, radius = in_units(geometry, lines.points, lines.radius)
     kinds = classified(geometry, points, radius, seen, pairs, along_row)
     chosen = np.flatnonzero(kinds)
+    if not len(chosen):
+        return []
     pairs, kinds = pairs[chosen], kinds[chosen]
-    # Segments of what ends and of the other, each settled beside p and q, with their copies.
-    beside, copies = np.empty((4, len(kinds)), dtype=np.int64), np.empty((4, len(kinds), 2), dtype=np.int64)
-    t: Tensor = _Crossing.apply(lines.points, lines.radius, geometry, seen, pairs, kinds, beside, copies)
-    in_p = as_numpy(t) < 0.5
-    row, column = np.where((kinds == Q_ENDS) == in_p, 0, 2) + np.where(in_p, 0, 1), np.arange(len(kinds))
-    return Ends(pairs, t, Seen(beside[row, column].astype(np.int32), copies[row, column].astype(np.int32)))
+    t: Tensor = _Crossing.apply(lines.points, lines.radius, geometry, seen, pairs, kinds)
+    dark = np.stack([s.segment != NOTHING for s in shadows] or [np.zeros(len(seen.segment), dtype=bool)])
+    smooth_p, smooth_q = np.empty(len(chosen), dtype=np.bool_), np.empty(len(chosen), dtype=np.bool_)
+    _runs_on(geometry.topology, seen.segment, seen.copy, dark, pairs.p, pairs.before, smooth_p)
+    _runs_on(geometry.topology, seen.segment, seen.copy, dark, pairs.q, pairs.after, smooth_q)
+    return [Jumps(pairs, t, smooth_p, smooth_q)]
 
 
 def classified(
@@ -91,12 +86,13 @@ class _Crossing(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, points: Tensor, radius: Tensor, geometry: Geometry, seen: Seen, pairs: Pairs, kinds: NDArray,
-        beside: NDArray, copies: NDArray,
-    ) -> Tensor:  # fmt: skip
-        """``beside`` (4, M) and ``copies`` (4, M, 2) are filled."""
+        ctx: Any, points: Tensor, radius: Tensor, geometry: Geometry, seen: Seen, pairs: Pairs, kinds: NDArray
+    ) -> Tensor:
         ctx.save_for_backward(points, radius)
         t = np.empty(len(kinds))
+        # Segments of what ends and of the other, each settled beside p and q, with their copies.
+        beside = np.empty((4, len(kinds)), dtype=np.int64)
+        copies = np.empty((4, len(kinds), 2), dtype=np.int64)
         _cross(
             *in_units(geometry, points, radius), geometry.topology, geometry.size, geometry.start, geometry.direction,
             seen.segment, seen.copy, pairs.p, pairs.q, kinds, beside, copies, t,
@@ -116,7 +112,7 @@ class _Crossing(torch.autograd.Function):
             by_points, by_radius,
         )  # fmt: skip
         by_points, by_radius = by_points / geometry.scale, by_radius / geometry.scale
-        return torch.from_numpy(by_points), torch.from_numpy(by_radius), None, None, None, None, None, None
+        return torch.from_numpy(by_points), torch.from_numpy(by_radius), None, None, None, None
 
 
 @njit(**INLINE)
@@ -316,3 +312,14 @@ def _showing_slopes(
     for c in range(6):
         ends_slopes[side, row, c] = found[c]
     radius_slopes[side, row] = found[6]
+
+
+@njit(**KERNEL)
+def _runs_on(topology, segment, copy, dark, near, far, result):
+    """Where pixels ``far`` show what ``near`` show, under the same lamps: colours do not run on past a shadow's rim."""
+    for m in range(len(near)):
+        a, b = near[m], far[m]
+        same = a != b and same_fiber(topology, segment, copy, a, b)
+        for lamp in range(len(dark)):
+            same = same and dark[lamp, a] == dark[lamp, b]
+        result[m] = same

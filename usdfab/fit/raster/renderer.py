@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from usdfab.fabric import FabricParameters
 from usdfab.fabric.optics import optics_of
 from usdfab.fibers.patch import RASTERIZATION_VERTICES
 from usdfab.fit.raster.curves import CurveModel, Polylines, Shapes, as_numpy, raster_copies
-from usdfab.fit.raster.edges import Jumps, blended, inside, outside, pixel_pairs
+from usdfab.fit.raster.edges import blended, pixel_pairs
 from usdfab.fit.raster.hits import Meeting, meet
 from usdfab.fit.raster.jumps import visible_edges
 from usdfab.fit.raster.segments import geometry_of
@@ -108,18 +108,11 @@ class RasterRenderer:
         met = meet(geometry, lines, seen)
         lit = self._lit(lines, met, seen, shadows)
         spread = self._pixel * geometry.scale / lines.radius
-        material = materials(look_, self._color_system)
-        flat = shaded(geometry, seen, met, lit, spread, material, self._lighting)
+        flat = shaded(geometry, seen, met, lit, spread, materials(look_, self._color_system), self._lighting)
         if self.settings.edges:
             parts = []
             for pairs, along_row in zip(self._pairs, (True, False), strict=True):
-                ends = visible_edges(geometry, lines, seen, pairs, along_row)
-                # What the other pixel sees, as it would look here.
-                at, lit_at = inside(ends.pairs, ends.t), torch.from_numpy(outside(ends.pairs, ends.t))
-                here = replace(geometry, start=geometry.start[at], direction=geometry.direction[at])
-                beyond = meet(here, lines, ends.beyond)
-                light = shaded(here, ends.beyond, beyond, lit[lit_at], spread, material, self._lighting)
-                parts.append(Jumps(ends.pairs, ends.t, light))
+                parts += visible_edges(geometry, lines, seen, shadows, pairs, along_row)
             flat = blended(flat, parts)
         return self._view.gain * look_.gain * flat
 
@@ -134,7 +127,7 @@ class RasterRenderer:
                 parts = []
                 for pairs, along_row in zip(self._pairs, (True, False), strict=True):
                     parts += shadow_edges(
-                        self._geometry, lines, met.distance, shines, seen, shadow, lamp, pairs, along_row
+                        self._geometry, lines, met.distance, seen, shadow, lamp, pairs, along_row
                     )  # fmt: skip
                 shines = blended(shines, parts)
             columns.append(shines)

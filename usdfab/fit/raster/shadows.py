@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from usdfab.fit.raster.curves import Polylines, as_numpy
-from usdfab.fit.raster.edges import Jumps, Pairs, crossing, crossing_slopes, outside
+from usdfab.fit.raster.edges import Jumps, Pairs, crossing, crossing_slopes
 from usdfab.fit.raster.hits import in_units
 from usdfab.fit.raster.segments import (
     BLOCK,
@@ -35,7 +35,6 @@ def shadow_edges(
     geometry: Geometry,
     lines: Polylines,
     distance: Tensor,
-    shines: Tensor,
     seen: Seen,
     shadow: Seen,
     lamp: Floats,
@@ -50,8 +49,6 @@ def shadow_edges(
     ----------
     distance: (N,)
         Of what the camera's rays meet.
-    shines: (N, 1)
-        1 where the lamp shines, 0 where not.
     lamp: (3,) metres
     """
     sign = np.zeros(len(pairs.p), dtype=np.int8)
@@ -67,8 +64,9 @@ def shadow_edges(
         return []
     pairs, sign = pairs[chosen], sign[chosen]
     t: Tensor = _Crossing.apply(lines.points, lines.radius, distance, geometry, shadow, place, pairs, sign)
-    # Light and shadow are the same everywhere on their sides of the rim.
-    return [Jumps(pairs, t, shines[torch.from_numpy(outside(pairs, t))])]
+    # Light and shadow are the same everywhere on their sides of the rim: nothing runs on.
+    flat = np.zeros(len(chosen), dtype=bool)
+    return [Jumps(pairs, t, flat, flat)]
 
 
 class _Crossing(torch.autograd.Function):
