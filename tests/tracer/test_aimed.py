@@ -60,9 +60,9 @@ def met(material, axis, first, incline, x, other, center, radius, light):
     normal = (start + t * flat) / radius
     sin_to, cos_to, h, ex, ey, ez, fx, fy, fz = fiber_frame(*other, *normal, *-d)
     sin_ti, cos_ti, phi = fiber_angles(*other, ex, ey, ez, fx, fy, fz, *light)
-    phi_tt = prepare_fiber(material, h, sin_to, cos_to)[9]
-    missing = (phi_tt - phi + math.pi) % (2 * math.pi) - math.pi
-    return (h, sin_to, cos_to, sin_ti, cos_ti, phi, phi_tt, (ex, ey, ez), (fx, fy, fz), *d, t), missing
+    prep = prepare_fiber(material, h, sin_to, cos_to)
+    missing = (prep[9] - phi + math.pi) % (2 * math.pi) - math.pi
+    return (prep, h, cos_to, sin_ti, cos_ti, phi, (ex, ey, ez), (fx, fy, fz), *d, t), missing
 
 
 def test_aim_finds_where_a_straight_fiber_transmits_towards_the_light():

@@ -49,18 +49,16 @@ __all__ = [
     "FIBER_SIZE",
     "PREPARED_FIBER",
     "ROUGHNESS_RANGE",
+    "drawn_lobe",
     "eval_fiber",
-    "eval_fiber_tt",
     "fiber_angles",
     "fiber_direction",
     "fiber_frame",
     "load_fiber",
-    "longitudinal_tt",
     "pack_fiber",
     "prepare_fiber",
     "sample_fiber",
     "sample_fiber_lobe",
-    "turn_tt",
 ]
 
 ETA_TEXTILE = 1.55
@@ -479,26 +477,15 @@ def eval_fiber(p, prep, sin_ti, cos_ti, phi):
 
 
 @njit(**_OPTIONS)
-def turn_tt(h, eta2):
-    """2 gamma_t - 2 gamma_o, rad: how far light that goes through a fiber at offset h turns; eta2 is eta' squared."""
-    return 2.0 * (_asin(h / math.sqrt(eta2)) - _asin(h))
-
-
-@njit(**_OPTIONS)
-def longitudinal_tt(p, sin_ti, cos_ti, sin_to, cos_to):
-    """M of the TT lobe, see `eval_fiber`."""
-    sin_tt = sin_to * p[_COS_TILT + 1] - cos_to * p[_SIN_TILT + 1]
-    cos_tt = abs(cos_to * p[_COS_TILT + 1] + sin_to * p[_SIN_TILT + 1])
-    return _longitudinal(p[_M_SCALE + 1], p[_INV_V + 1], sin_ti, cos_ti, sin_tt, cos_tt)
-
-
-@njit(**_OPTIONS)
-def eval_fiber_tt(p, prep, sin_ti, cos_ti, phi):
-    """The part of `eval_fiber` that the TT lobe has: (fr, fg, fb)."""
-    d = _azimuthal(p, phi - prep[9])
-    if d > 0.0:
-        d *= _longitudinal(p[_M_SCALE + 1], p[_INV_V + 1], sin_ti, cos_ti, prep[2], prep[3])
-    return d * prep[12], d * prep[13], d * prep[14]
+def drawn_lobe(prep, u):
+    """The lobe that a uniform number chooses, and the middle of its azimuth: 0 R, 1 TT, 2 TRT, 3 the rest."""
+    if u < prep[21]:
+        return 0, prep[8]
+    if u < prep[21] + prep[22]:
+        return 1, prep[9]
+    if u < prep[21] + prep[22] + prep[23]:
+        return 2, prep[10]
+    return 3, 0.0
 
 
 @njit(**_OPTIONS)
@@ -507,23 +494,15 @@ def _draw(p, prep, u0, u1, u2, u3):
 
     References: d'Eon et al. 2011 (M); D by the inverse of the logistic's distribution function.
     """
-    # Lobe.
-    if u0 < prep[21]:
-        lobe = 0
-    elif u0 < prep[21] + prep[22]:
-        lobe = 1
-    elif u0 < prep[21] + prep[22] + prep[23]:
-        lobe = 2
-    else:
-        lobe = 3
+    lobe, center = drawn_lobe(prep, u0)
     if lobe == 0:
-        sin_o, cos_o, center, v, scale = prep[0], prep[1], prep[8], p[_V], p[_M_SCALE]
+        sin_o, cos_o, v, scale = prep[0], prep[1], p[_V], p[_M_SCALE]
     elif lobe == 1:
-        sin_o, cos_o, center, v, scale = prep[2], prep[3], prep[9], p[_V + 1], p[_M_SCALE + 1]
+        sin_o, cos_o, v, scale = prep[2], prep[3], p[_V + 1], p[_M_SCALE + 1]
     elif lobe == 2:
-        sin_o, cos_o, center, v, scale = prep[4], prep[5], prep[10], p[_V + 2], p[_M_SCALE + 2]
+        sin_o, cos_o, v, scale = prep[4], prep[5], p[_V + 2], p[_M_SCALE + 2]
     else:
-        sin_o, cos_o, center, v, scale = prep[6], prep[7], 0.0, p[_V + 2], p[_M_SCALE + 2]
+        sin_o, cos_o, v, scale = prep[6], prep[7], p[_V + 2], p[_M_SCALE + 2]
 
     # Inclination. M is the distribution of sin(theta_i) of a direction spread around the mirror cone's -theta_o with
     # density ~ e^(cos(x) / v) (von Mises-Fisher): draw 1 - cos(x), then the way around, of which only the cosine

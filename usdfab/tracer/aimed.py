@@ -23,14 +23,16 @@ import math
 import numpy as np
 from numba import njit
 
-from usdfab.scattering.fiber_numba import (
+from usdfab.scattering.fiber_numba import drawn_lobe, fiber_angles, fiber_direction, fiber_frame, prepare_fiber
+from usdfab.scattering.fiber_numba_tt import (
+    attenuation_tt,
+    azimuth_scale,
     eval_fiber_tt,
-    fiber_angles,
-    fiber_direction,
-    fiber_frame,
     longitudinal_tt,
-    prepare_fiber,
+    middle_tt,
+    modified_eta2,
     turn_tt,
+    turn_tt_slope,
 )
 from usdfab.tracer.counted import next_uniform
 from usdfab.tracer.film import RAYS
@@ -76,15 +78,12 @@ def _wrapped(angle):
 @njit(**KERNEL)
 def flight_from(axes, sin_ti, cos_ti, phi, scale, u0, prepared, ox, oy, oz, lx, ly, lz, ix, iy):
     """The flight of a direction that ``sample_fiber_lobe`` drew with ``u0``; ``axes`` (9) are axis, e and f."""
-    lobe, middle, share = 3.0, 0.0, prepared[21] + prepared[22] + prepared[23]
-    if u0 < prepared[21]:
-        lobe, middle = 0.0, prepared[8]
-    elif u0 < prepared[21] + prepared[22]:
-        lobe, middle = 1.0, prepared[9]
-    elif u0 < share:
-        lobe, middle = 2.0, prepared[10]
+    lobe, middle = drawn_lobe(prepared, u0)
     x = _wrapped(phi - middle)
-    return (*axes, sin_ti, cos_ti, middle, x, scale, lobe, ox, oy, oz, lx, ly, lz, np.float64(ix), np.float64(iy))
+    return (
+        *axes, sin_ti, cos_ti, middle, x, scale, np.float64(lobe), ox, oy, oz, lx, ly, lz, np.float64(ix),
+        np.float64(iy),
+    )  # fmt: skip
 
 
 @njit(**KERNEL, forceinline=True)
@@ -178,8 +177,7 @@ def _in_reach(h, cos_to, missing, eta2, lever, radius, turn, d):
     reach = 1.3 * d * turn / cos_to
     moved = reach * lever / radius
     end = min(abs(h) + moved, 0.99)
-    steepest = 2.0 / math.sqrt(1.0 - end * end) - 2.0 / math.sqrt(eta2 - end * end)
-    return abs(missing) <= steepest * moved + reach
+    return abs(missing) <= -turn_tt_slope(end, eta2) * moved + reach
 
 
 @njit(**KERNEL)
@@ -207,7 +205,7 @@ def _offset_towards(h, psi, eta2, ratio):
         turn = math.asin(ratio * h) - start
         error = turn_tt(h, eta2) + turn - psi
         follow = ratio / math.sqrt(1.0 - ratio * ratio * h * h)
-        slope = 2.0 / math.sqrt(eta2 - h * h) - 2.0 / math.sqrt(1.0 - h * h) + follow
+        slope = turn_tt_slope(h, eta2) + follow
         if abs(error) < 0.01:
             return turn, abs(slope) / follow
         h = min(max(h - error / min(slope, -0.2), -0.99), 0.99)
@@ -243,15 +241,15 @@ def _azimuth_of_turn(flight, azimuth, e, f, turn):
 
 
 @njit(**KERNEL)
-def aim(p, h, sin_to, cos_to, sin_ti, cos_ti, phi, phi_tt, e, f, dx, dy, dz, distance, radius, flight, x):
+def aim(p, prep, h, cos_to, sin_ti, cos_ti, phi, e, f, dx, dy, dz, distance, radius, flight, x):
     """Which azimuth would have met the fiber so that it transmits towards the light.
 
     Parameters
     ----------
-    p, h, sin_to, cos_to:
-        Material of the fiber that was met, and how, as for ``prepare_fiber``.
-    sin_ti, cos_ti, phi, phi_tt:
-        The light, as for ``eval_fiber``, and the middle of the lobe TT.
+    p, prep, h, cos_to:
+        Material of the fiber that was met, its vertex of ``prepare_fiber``, and how it was met, as given to that.
+    sin_ti, cos_ti, phi:
+        The light, as for ``eval_fiber``.
     e, f, distance, radius:
         Frame of the fiber that was met, length of the ray, and the fiber's radius.
     dx, dy, dz, flight, x:
@@ -265,7 +263,7 @@ def aim(p, h, sin_to, cos_to, sin_ti, cos_ti, phi, phi_tt, e, f, dx, dy, dz, dis
     if cos_to < 0.02:
         return nothing
     lever = distance * cos_to + radius * math.sqrt(max(1.0 - h * h, 0.0))
-    eta2 = 1.0 + p[4] / (cos_to * cos_to)
+    eta2 = modified_eta2(p, cos_to)
     # The derivative of a direction by its azimuth is its cross product with the axis.
     turn = abs(
         f[0] * (flight[1] * dz - flight[2] * dy)
@@ -274,7 +272,7 @@ def aim(p, h, sin_to, cos_to, sin_ti, cos_ti, phi, phi_tt, e, f, dx, dy, dz, dis
     )
     lobe, scale = flight[_LOBE], flight[_SCALE]
     d = _half_window(lobe, scale)
-    if not _in_reach(h, cos_to, _wrapped(phi_tt - phi), eta2, lever, radius, turn, d):
+    if not _in_reach(h, cos_to, _wrapped(middle_tt(prep) - phi), eta2, lever, radius, turn, d):
         return nothing
     ratio = radius / math.sqrt(lever * lever + radius * radius * h * h)
     if ratio >= 0.999:
@@ -288,8 +286,8 @@ def aim(p, h, sin_to, cos_to, sin_ti, cos_ti, phi, phi_tt, e, f, dx, dy, dz, dis
     middle = x + step
     if steep < _LEAST_TURN or abs(step) > d or (lobe < 3 and abs(middle) > math.pi):
         return nothing
-    m = longitudinal_tt(p, sin_ti, cos_ti, sin_to, cos_to)
-    width = p[11] / steep
+    m = longitudinal_tt(p, prep, sin_ti, cos_ti)
+    width = azimuth_scale(p) / steep
     if lobe == 3:
         return m * density_in_window(lobe, scale, middle) / steep, middle, width
     # Two logistics, nearly as if they were normal distributions: their product, and its integral.
@@ -358,11 +356,10 @@ def share_aimed(world, buffer, stream, cloth, m, inverse, flight, hit, p, radius
         if lr + lg + lb <= 0.0:
             continue
         sin_ti, cos_ti, phi = fiber_angles(ax, ay, az, ex, ey, ez, fx, fy, fz, wx, wy, wz)
-        phi_tt = prepare_fiber(p, h, sin_to, cos_to)[9]
+        prep = prepare_fiber(p, h, sin_to, cos_to)
         value, _middle, _width = aim(
-            p, h, sin_to, cos_to, sin_ti, cos_ti, phi, phi_tt, (ex, ey, ez), (fx, fy, fz), dx, dy, dz, t, radius,
-            flight, y,
-        )  # fmt: skip
+            p, prep, h, cos_to, sin_ti, cos_ti, phi, (ex, ey, ez), (fx, fy, fz), dx, dy, dz, t, radius, flight, y
+        )
         if beta * value >= LEAST:
             share += 1.0 / _TURNS
     return stream, share
@@ -386,7 +383,8 @@ def aimed_light(
     (stream, radiance (3))
     """
     value, middle, width = aimed
-    likely = _ROULETTE * value * max(beta[0] * prepared[12], beta[1] * prepared[13], beta[2] * prepared[14])
+    red, green, blue = attenuation_tt(prepared)
+    likely = _ROULETTE * value * max(beta[0] * red, beta[1] * green, beta[2] * blue)
     likely = min(max(likely, _ROULETTE_LEAST), 1.0)
     stream, u0 = next_uniform(stream)
     stream, u1 = next_uniform(stream)
@@ -408,9 +406,8 @@ def aimed_light(
     reach = distance * (1.0 - 1e-6)
     if fr + fg + fb <= 0.0 or light_blocks(world.lights, ox, oy, oz, wx, wy, wz, reach):
         return nothing
-    out[RAYS] += 1.0
     share = light_share(
-        world, buffer, time, cloth[0], cloth[1], m, up, slab_mesh, ox, oy, oz, lx, ly, lz, hit[1], hit[2], wx, wy,
+        world, buffer, out, time, cloth[0], cloth[1], m, up, slab_mesh, ox, oy, oz, lx, ly, lz, hit[1], hit[2], wx, wy,
         wz, reach,
     )  # fmt: skip
     share *= density_in_window(flight[_LOBE], flight[_SCALE], x1) / (q * likely)

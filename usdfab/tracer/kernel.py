@@ -20,7 +20,6 @@ from usdfab.scattering.fiber_numba import (
     FIBER_SIZE,
     PREPARED_FIBER,
     eval_fiber,
-    eval_fiber_tt,
     fiber_angles,
     fiber_direction,
     fiber_frame,
@@ -30,6 +29,7 @@ from usdfab.scattering.fiber_numba import (
     sample_fiber_lobe,
 )
 from usdfab.scattering.fiber_numba_grad import PREPARED_SLOPES, prepare_slopes
+from usdfab.scattering.fiber_numba_tt import azimuth_scale, eval_fiber_tt
 from usdfab.scattering.surface_numba import PREPARED_SURFACE, eval_surface, prepare_surface, sample_surface
 from usdfab.tracer.aimed import AZIMUTH, LEAST, NARROW, NO_FLIGHT, aim, aimed_light, fiber_at, flight_from, share_aimed
 from usdfab.tracer.counted import next_uniform
@@ -183,7 +183,8 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
         ax = ay = az = ex = ey = ez = fx = fy = fz = 0.0
         wox = woy = woz = 0.0
         if fiber:
-            radius = radius_at(patches.records, patch, np.int64(words[PRIM])) / up
+            if straight:
+                radius = radius_at(patches.records, patch, np.int64(words[PRIM])) / up
             curve, ax, ay, az, nx, ny, nz = fiber_at(patches, buffer, patch, m, inverse)
             owner = patches.curves[int(patches.table[patch, FIRST_CURVE]) + curve]
             row = np.int64(owner[MATERIAL])
@@ -264,13 +265,13 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
                 reach = distance * (1.0 - 1e-6)
                 # Area lights stand in each other's way, as they do for rays that the BSDF draws.
                 if cr + cg + cb > 0.0 and not light_blocks(lights, ox, oy, oz, wx, wy, wz, reach):
-                    out[RAYS] += 1.0
                     if fiber:
                         share = light_share(
-                            world, buffer, time, first_patch, variants, m, up, slab_mesh, ox, oy, oz, lx, ly, lz, ix,
-                            iy, wx, wy, wz, reach,
+                            world, buffer, out, time, first_patch, variants, m, up, slab_mesh, ox, oy, oz, lx, ly, lz,
+                            ix, iy, wx, wy, wz, reach,
                         )  # fmt: skip
                     else:
+                        out[RAYS] += 1.0
                         share = transmittance(world, buffer, time, ox, oy, oz, wx, wy, wz, near, reach, nowhere, 0.0)
                     if tape is None and straight and share > 0.0:
                         fr, fg, fb = eval_fiber_tt(fiber_material, prepared, sin_ti, cos_ti, phi)
@@ -294,9 +295,9 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
                         direct_r, direct_g, direct_b = direct_r + cr, direct_g + cg, direct_b + cb
                 if tape is None and straight:
                     aimed = aim(
-                        fiber_material, h, sin_to, cos_to, sin_ti, cos_ti, phi, prepared[9], (ex, ey, ez),
-                        (fx, fy, fz), dx, dy, dz, math.sqrt((ox - sx) ** 2 + (oy - sy) ** 2 + (oz - sz) ** 2), radius,
-                        flight, flight[AZIMUTH],
+                        fiber_material, prepared, h, cos_to, sin_ti, cos_ti, phi, (ex, ey, ez), (fx, fy, fz), dx, dy,
+                        dz, math.sqrt((ox - sx) ** 2 + (oy - sy) ** 2 + (oz - sz) ** 2), radius, flight,
+                        flight[AZIMUTH],
                     )  # fmt: skip
                     # Calls cost their arguments, so only where it pays.
                     if max(beta_r, beta_g, beta_b) * aimed[0] >= LEAST:
@@ -323,11 +324,12 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
                 if tape is not None:
                     # The same direction, weighed as the tape knows it.
                     _s, _c, _p, wr, wg, wb = sample_fiber_lobe(fiber_material, prepared, u0, u1, u2, u3)
-            sent = lights.deltas and fiber_material[11] < NARROW
+            scale = azimuth_scale(fiber_material)
+            sent = lights.deltas and scale < NARROW
             if tape is None and sent:
                 flight = flight_from(
-                    (ax, ay, az, ex, ey, ez, fx, fy, fz), sin_ti, cos_ti, phi, fiber_material[11], u0, prepared, ox, oy,
-                    oz, lx, ly, lz, ix, iy,
+                    (ax, ay, az, ex, ey, ez, fx, fy, fz), sin_ti, cos_ti, phi, scale, u0, prepared, ox, oy, oz, lx,
+                    ly, lz, ix, iy,
                 )  # fmt: skip
             if tape is not None:
                 tape_scatter(tape, row, fiber_material, prepared, slopes, u0, sin_ti, cos_ti, phi)

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
+from usdfab.tracer.film import RAYS
 from usdfab.tracer.intrinsics import ARGS_PLAIN, INST, KERNEL, PRIM, TFAR, U, V, intersect
 from usdfab.tracer.slab import enter_slab, leave_slab, slab_occluded, to_patch
 from usdfab.tracer.textures import opacity_at
@@ -194,9 +195,11 @@ def transmittance(world, buffer, time, ox, oy, oz, dx, dy, dz, near, tmax, skip_
 
 @njit(**KERNEL, forceinline=True)
 def light_share(
-    world, buffer, time, first, count, m, up, slab_mesh, ox, oy, oz, lx, ly, lz, ix, iy, wx, wy, wz, reach
+    world, buffer, out, time, first, count, m, up, slab_mesh, ox, oy, oz, lx, ly, lz, ix, iy, wx, wy, wz, reach
 ):  # fmt: skip
     """Share of a lamp's light that comes to a fiber: fibers of its own cloth stop it, then ``transmittance``.
+
+    Counts its rays in ``out``, the film's channels of the pixel.
 
     Parameters
     ----------
@@ -208,6 +211,7 @@ def light_share(
     patches = world.patches
     px, py, pz = to_patch(m, wx, wy, wz)
     stretch = math.sqrt(px * px + py * py + pz * pz)
+    out[RAYS] += 1.0
     blocked, through = slab_occluded(
         world.embree[1], patches.table, patches.handles, buffer, first, count, lx, ly, lz, ix, iy, px / stretch,
         py / stretch, pz / stretch, reach * stretch,
@@ -218,6 +222,7 @@ def light_share(
         return 1.0
     back, thickness = leave_slab(patches, first, up, pz)
     start = through / stretch - back
+    out[RAYS] += 1.0
     return transmittance(
         world, buffer, time, ox + start * wx, oy + start * wy, oz + start * wz, wx, wy, wz, 0.0, reach - start,
         slab_mesh, back + 2.0 * thickness,
