@@ -19,8 +19,12 @@ def _interlaces(matrix: np.ndarray) -> bool:
 def weaves(draw: st.DrawFn) -> Weave:
     shape = draw(st.tuples(st.integers(2, 6), st.integers(2, 6)))
     matrix = draw(arrays(np.uint8, shape, elements=st.integers(0, 1), fill=st.nothing()))
-    # Mend most of the matrices in which a yarn never interlaces, so that few draws are wasted.
+    # Mend yarns that never interlace, so that few draws are wasted; all others stay as they are drawn.
     matrix = matrix ^ (np.add.outer(np.arange(shape[0]), np.arange(shape[1])) % 2).astype(np.uint8)
+    for mended in (matrix, matrix.T):
+        for k, line in enumerate(mended):
+            if line.min() == line.max():
+                line[k % len(line)] ^= 1
     assume(_interlaces(matrix))
     return Weave(matrix)
 
