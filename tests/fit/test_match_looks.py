@@ -35,7 +35,7 @@ from usdfab.usd.rig import Rig, ring_rig, sample_scene
 YARN = YarnParameters(count=3, radius=3e-4, fiber_count=6, albedo=(0.6, 0.4, 0.3), roughness_azimuthal=0.3)
 CLOTH = FabricParameters(weave_from_name("plain"), (2e-3, 2e-3), YARN, replace(YARN, albedo=(0.3, 0.5, 0.7)))
 SHAPES = MatchSettings(width=32, spp=16, iterations=0, levels=(1,), free=("radius", "flattening"))
-SHAPE, WIDTH, LAMPS, SPUN, PLIED, MELANGE, UNEVEN, FLYAWAYS = questions(True, rig_known=False)
+SHAPE, WIDTH, SHARPNESS, LAMPS, SPUN, PLIED, MELANGE, UNEVEN, FLYAWAYS = questions(True, rig_known=False)
 RING = SHAPE[1]
 """Full yarns under a ring lamp."""
 
@@ -119,7 +119,7 @@ def test_what_is_more_already_stays() -> None:
 def test_questions_and_answers() -> None:
     assert questions(False, rig_known=False) == ()
     known = questions(True, rig_known=True)
-    assert len(known[0]) == 2 and known[2] == ()
+    assert len(known[0]) == 2 and known[2] == known[3] == ()
     start = Seen(CLOTH, None)
     asked = questions(True, rig_known=False)
     assert looks_at(start, asked, ()) == start

@@ -12,16 +12,17 @@ from small_network import small_net
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, YarnParameters, weave_from_name
-from usdfab.fit import features, match_stage
+from usdfab.fit import features, match_space, match_stage
 from usdfab.fit.features import FeatureNet
 from usdfab.fit.match_run import run_match
-from usdfab.fit.match_space import EXPOSURE, MOVES, MatchSpace, Move
+from usdfab.fit.match_space import BLUR, BLUR_UNIT, EXPOSURE, MOVES, MatchSpace, Move
 from usdfab.fit.match_stage import MatchResult, MatchSettings, checked_match_quality, match_photo
 from usdfab.fit.match_steps import SOFT, broyden_update, damped_step, normal_equations, soft_l1
 from usdfab.fit.raster_stage import StageSettings
 from usdfab.imaging import denoise
+from usdfab.imaging.lens import through_lens
 from usdfab.tracer import RenderSettings, Tracer
-from usdfab.usd.rig import swatch_scene
+from usdfab.usd.rig import rig_for, swatch_scene
 
 YARN = YarnParameters(count=3, radius=3e-4, fiber_count=6, albedo=(0.6, 0.4, 0.3), roughness_azimuthal=0.3)
 CLOTH = FabricParameters(weave_from_name("plain"), (2e-3, 2e-3), YARN, replace(YARN, albedo=(0.3, 0.5, 0.7)))
@@ -220,3 +221,43 @@ def test_an_unknown_quality_is_refused() -> None:
     with pytest.raises(UsdfabError, match="no quality 'best'"):
         checked_match_quality("best")
     assert checked_match_quality("draft", 7).seed == 7
+
+
+# --- the camera ---
+
+
+@pytest.mark.parametrize("pixels", [1.2, 0.7, -0.9])
+def test_the_cameras_blur_is_found(
+    pixels: float, goal: np.ndarray, net: FeatureNet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Colours, exposure and sharpness from a photo that is blurred or sharpened, whose scale says how far in metres."""
+    monkeypatch.setattr(match_space, "BLUR_UNIT", 1.0 / SMALL.width)
+    settings = replace(SMALL, free=("albedo", BLUR, EXPOSURE), iterations=3)
+    photo = np.maximum(through_lens(goal, pixels), 0.0)
+    result = match_photo(CLOTH, photo, settings, net=net, exposure=1.2)
+    assert result.rig is not None
+    found = result.rig.blur * settings.width / CLOTH.size[0]
+    assert found * abs(found) == pytest.approx(pixels * abs(pixels), abs=0.15)
+    assert result.losses[-1] < 0.1 * result.losses[0]
+
+
+def test_the_blur_of_a_known_rig_stays(goal: np.ndarray, net: FeatureNet) -> None:
+    settings = replace(SMALL, free=(BLUR, EXPOSURE))
+    rig = replace(rig_for(CLOTH.size), blur=1.2 * CLOTH.size[0] / settings.width)
+    photo = through_lens(goal, 1.2)
+    known, sharp = (
+        match_photo(CLOTH, photo, settings, net=net, exposure=1.2, rig=r, rig_known=True)
+        for r in (rig, rig_for(CLOTH.size))
+    )
+    assert known.rig == rig and sharp.rig == rig_for(CLOTH.size)
+    assert known.losses[-1] < 0.1 * sharp.losses[-1]
+
+
+def test_blur_moves_through_sharp_and_stops() -> None:
+    space = MatchSpace.about(CLOTH, (BLUR,))
+    unit = BLUR_UNIT * CLOTH.size[0]
+    found = [space.blur_at(np.array([x])) / unit for x in (-100.0, -4.0, 0.0, 4.0, 100.0)]
+    assert found == pytest.approx([-np.sqrt(1.5), -1.0, 0.0, 1.0, 2.0])
+    beyond = MatchSpace.about(CLOTH, (BLUR,), blur=3 * unit)
+    assert beyond.blur_at(np.zeros(1)) == 3 * unit
+    assert beyond.blur_at(np.array([-20.0])) == pytest.approx(2 * unit)

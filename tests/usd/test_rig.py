@@ -134,7 +134,7 @@ def test_a_ring_in_a_file_and_in_memory_agree(fabric, tmp_path):
 
 def test_a_rig_is_read_from_wherever_it_stands(fabric, tmp_path):
     """Turned, moved, in millimetres and y up: the same rig in its own frame."""
-    own = ring_rig(SIZE, 0.8, 2, 0.3)
+    own = replace(ring_rig(SIZE, 0.8, 2, 0.3), blur=-2e-5)
     path = write_rig(tmp_path / "r.usda", SIZE, rig=own)
     stage = Usd.Stage.CreateNew(str(tmp_path / "moved.usda"))
     UsdGeom.SetStageMetersPerUnit(stage, 0.001)
@@ -148,6 +148,7 @@ def test_a_rig_is_read_from_wherever_it_stands(fabric, tmp_path):
     rig = read_rig(tmp_path / "moved.usda")
     np.testing.assert_allclose(rig.sample_size, SIZE, rtol=1e-5)
     assert rig.camera_height == pytest.approx(own.camera_height, rel=1e-5)
+    assert rig.blur == pytest.approx(own.blur, rel=1e-6)
     for light, position in zip(rig.lights, own.light_positions, strict=True):
         np.testing.assert_allclose(light.position, position, atol=1e-8)
     fabric = replace(fabric, size=SIZE)

@@ -17,9 +17,10 @@ from usdfab.fit.pipeline import Fit, fit_photo
 from usdfab.fit.result_folder import made_folder, no_result, read_result, write_result
 from usdfab.fit.straighten import straightened
 from usdfab.imaging import denoise, linear_to_srgb, side_by_side, srgb_to_linear, write_image
+from usdfab.imaging.lens import through_lens
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.fabric_io import write_fabric
-from usdfab.usd.rig import Rig, sample_scene
+from usdfab.usd.rig import Rig, blur_in_pixels, sample_scene
 
 if TYPE_CHECKING:
     from usdfab.fit.features import FeatureNet
@@ -184,12 +185,13 @@ def photo_middle(fit: Fit) -> NDArray[np.float32]:
 
 
 def swatch(fabric: FabricParameters, seed: int = 0, rig: Rig | None = None) -> NDArray[np.float32]:
-    """A denoised picture of the whole fabric under ``rig``, ``SIDE`` pixels along its shorter side."""
+    """A denoised picture of the whole fabric by the camera of ``rig``, ``SIDE`` pixels along its shorter side."""
     scene = sample_scene(fabric, rig)
     scale = SIDE / min(fabric.size)
     size = (round(scale * fabric.size[0]), round(scale * fabric.size[1]))
     render = Tracer(scene).render(scene.cameras[0], RenderSettings(size, spp=SAMPLES, seed=seed + 1))
-    return denoise(render.pixels, render.albedo, render.normal)
+    clean = denoise(render.pixels, render.albedo, render.normal)
+    return np.maximum(through_lens(clean, blur_in_pixels(rig, scale)), np.float32(0.0))
 
 
 def _read_row(record: Path, about: dict[str, Any]) -> FitRow | None:

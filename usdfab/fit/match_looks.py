@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from usdfab.fabric import SYSTEMS, FabricParameters, YarnParameters
+from usdfab.fit.match_space import BLUR_UNIT
 from usdfab.usd.rig import Rig, rig_for, ring_rig
 
 RING_ELEVATIONS = (0.6,)
@@ -47,6 +48,9 @@ SURFACE_ANGLES = (0.25, -0.25, 0.5, -0.5)
 
 WIDTHS = (0.85, 1.15)
 """Of the yarns, times the start's: how dark the valleys between yarns are decides much."""
+
+BLURS = (-0.8, 0.8, 1.3)
+"""Of the camera, in ``BLUR_UNIT``: photos are sharpened, or enlarged, or not quite in focus."""
 
 CLOSED_COVER = 1.04
 """Width over spacing of yarns that leave no gap. What looks like a gap may be a valley."""
@@ -85,6 +89,7 @@ def questions(shapes: bool, rig_known: bool) -> tuple[tuple[Look, ...], ...]:
         # these are asked for at once.
         tuple(_then(shape, lamp) for shape in (_full, _then(_full, _closed)) for lamp in lamps),
         tuple(_width(w) for w in WIDTHS),
+        () if rig_known else tuple(map(_blurred, BLURS)),
         () if rig_known else moved,
         tuple(map(_spun, SURFACE_ANGLES)),
         (_plied,),
@@ -121,7 +126,18 @@ def _elevated(elevation: float) -> Look:
 
     def look(seen: Seen) -> Seen:
         rig = seen.rig or rig_for(seen.fabric.size)
-        return Seen(seen.fabric, ring_rig(seen.fabric.size, elevation, rig.lamps, rig.azimuth))
+        there = ring_rig(seen.fabric.size, elevation, rig.lamps, rig.azimuth)
+        return Seen(seen.fabric, replace(there, blur=rig.blur))
+
+    return look
+
+
+def _blurred(units: float) -> Look:
+    """The same lamps through another lens."""
+
+    def look(seen: Seen) -> Seen:
+        rig = seen.rig or rig_for(seen.fabric.size)
+        return Seen(seen.fabric, replace(rig, blur=units * BLUR_UNIT * seen.fabric.size[0]))
 
     return look
 

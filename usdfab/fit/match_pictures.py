@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from usdfab.fabric import FabricParameters
 from usdfab.imaging import denoise
+from usdfab.imaging.lens import through_lens
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import Rig, sample_scene
 
@@ -61,16 +62,20 @@ class MatchPictures:
         render = Tracer(scene).render(scene.cameras[0], RenderSettings(size, spp=self.spp, seed=self.seed))
         return denoise(render.pixels, render.albedo, render.normal)
 
-    def residuals(self, picture: Singles, exposure: float) -> Singles:
-        """(R,) differences of the statistics from the target's, each matrix in units of the target's mean entry, and of
+    def residuals(self, picture: Singles, exposure: float, blur: float = 0.0) -> Singles:
+        """What differs at an exposure, through a camera whose blur is given in pixels (``imaging.lens``).
+
+        (R,) differences of the statistics from the target's, each matrix in units of the target's mean entry, and of
         the mean colours, in units of the mean over the target's channels."""
         import torch
 
         from usdfab.fit.texture import rolled_off, texture_statistics
 
         target = self.target
+        # Sharpening goes below black, which no photo does.
+        seen = np.maximum(through_lens(picture, blur), np.float32(0.0))
         with torch.inference_mode():
-            image = torch.from_numpy(np.float32(exposure) * picture).permute(2, 0, 1)[None]
+            image = torch.from_numpy(np.float32(exposure) * seen).permute(2, 0, 1)[None]
             found = texture_statistics(image, target.net, target.levels, target.kind)
             parts = []
             for ours, theirs, scale, upper in zip(

@@ -25,6 +25,18 @@ EXPOSURE = "exposure"
 EXPOSURE_STEP = 0.15
 """Of the exposure's logarithm."""
 
+BLUR = "blur"
+BLUR_STEP = 0.25
+"""Of the camera's ``b |b|``, in which pictures are smooth at 0, in squared units of ``BLUR_UNIT``."""
+BLUR_UNIT = 1.0 / 240.0
+"""Of the photo's width: a pixel of the pictures by which fits are judged. Photos are enlarged, out of focus, sharpened
+by about so much."""
+BLUR_RANGE = (-1.5, 4.0)
+"""Of ``b |b|``: twice the unit is where fibers are gone; sharper than the lower end, seams show."""
+
+OF_THE_CAMERA = (BLUR, EXPOSURE)
+"""Coordinates of the photo, not of the cloth: another picture is not needed to see what they do."""
+
 CHANNELS = "rgb"
 
 
@@ -99,26 +111,35 @@ class MatchSpace:
     start:
         The fabric at coordinates 0.
     names: (P,)
-        ``warp.radius``, ..., ``weft.albedo.b``, ``exposure``.
+        ``warp.radius``, ..., ``weft.albedo.b``, ``blur``, ``exposure``.
     light:
         The exposure at coordinates 0.
+    blur:
+        ``Rig.blur`` at coordinates 0.
     """
 
     start: FabricParameters
     names: tuple[str, ...]
     light: float = 1.0
+    blur: float = 0.0
 
     @classmethod
-    def about(cls, start: FabricParameters, free: Sequence[str] = (*MOVES, EXPOSURE), light: float = 1.0) -> MatchSpace:
+    def about(
+        cls,
+        start: FabricParameters,
+        free: Sequence[str] = (*MOVES, *OF_THE_CAMERA),
+        light: float = 1.0,
+        blur: float = 0.0,
+    ) -> MatchSpace:
         """All coordinates of the parameters named.
 
         Raises
         ------
         UsdfabError
-            For a name that is not in ``MOVES`` and not ``exposure``.
+            For a name that is not in ``MOVES``, and neither ``blur`` nor ``exposure``.
         """
         for name in free:
-            if name not in MOVES and name != EXPOSURE:
+            if name not in MOVES and name not in OF_THE_CAMERA:
                 raise UsdfabError(f"the match stage moves no '{name}'", remedy=f"choose from {', '.join(MOVES)}")
         names = [
             f"{system}.{name}{part}"
@@ -127,12 +148,12 @@ class MatchSpace:
             if name in free
             for part in ([f".{c}" for c in CHANNELS] if name == "albedo" else [""])
         ]
-        return cls(start, (*names, EXPOSURE) if EXPOSURE in free else tuple(names), light)
+        return cls(start, (*names, *(name for name in OF_THE_CAMERA if name in free)), light, blur)
 
     @property
     def spread(self) -> Floats:
         """(P,) standard deviations of the prior, in steps."""
-        return np.array([3.0 if n == EXPOSURE else MOVES[n.split(".")[1]].spread for n in self.names])
+        return np.array([3.0 if n in OF_THE_CAMERA else MOVES[n.split(".")[1]].spread for n in self.names])
 
     def fabric(self, point: Floats) -> FabricParameters:
         """The fabric at a point (P,)."""
@@ -144,15 +165,28 @@ class MatchSpace:
 
     def exposure(self, point: Floats) -> float:
         """What pictures are multiplied by at a point (P,)."""
-        steps = float(point[-1]) if self.names[-1] == EXPOSURE else 0.0
-        return self.light * math.exp(EXPOSURE_STEP * steps)
+        return self.light * math.exp(EXPOSURE_STEP * self._steps(point, EXPOSURE))
+
+    def blur_at(self, point: Floats) -> float:
+        """``Rig.blur`` at a point (P,), metres."""
+        steps = self._steps(point, BLUR)
+        if steps == 0.0:
+            return self.blur
+        unit = BLUR_UNIT * self.start.size[0]
+        start = self.blur * abs(self.blur) / unit**2
+        low, high = min(BLUR_RANGE[0], start), max(BLUR_RANGE[1], start)
+        square = min(max(start + BLUR_STEP * steps, low), high)
+        return math.copysign(unit * math.sqrt(abs(square)), square)
+
+    def _steps(self, point: Floats, name: str) -> float:
+        return float(point[self.names.index(name)]) if name in self.names else 0.0
 
     def deviations(self, point: Floats, steps: Floats) -> dict[str, float]:
-        """Standard deviations ``steps`` (P,) at a point in the parameters' own units, by name; the exposure's not."""
+        """Standard deviations ``steps`` (P,) at a point in the parameters' own units, by name; the camera's not."""
         fabric = self.fabric(point)
         result = {}
         for name, deviation in zip(self.names, steps, strict=True):
-            if name == EXPOSURE:
+            if name in OF_THE_CAMERA:
                 continue
             system, field, *channel = name.split(".")
             value = getattr(fabric.system(system), field)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""The match stage: shape, appearance and exposure, until the texture of path-traced pictures is the photo's.
+"""The match stage: shape, appearance, exposure and sharpness, until the texture of path-traced pictures is the photo's.
 
 Everything that the tracer shows takes part: light that scatters many times, gaps, shadows between yarns, flyaways,
 plies. Derivatives of the texture statistics are finite differences between denoised pictures of the same random draws,
@@ -22,11 +22,11 @@ from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
 from usdfab.fit.match_looks import Seen, looks_at, questions
 from usdfab.fit.match_pictures import MatchPictures
-from usdfab.fit.match_space import EXPOSURE, MOVES, MatchSpace
+from usdfab.fit.match_space import BLUR, EXPOSURE, MOVES, OF_THE_CAMERA, MatchSpace
 from usdfab.fit.match_steps import broyden_update, damped_step, normal_equations, soft_l1
 from usdfab.fit.stage_file import load_stage, save_stage
 from usdfab.tracer.checkpoint import fingerprint
-from usdfab.usd.rig import Rig
+from usdfab.usd.rig import Rig, blur_in_pixels, rig_for
 
 if TYPE_CHECKING:
     from usdfab.fit.features import FeatureNet
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-FORMAT = "usdfab-match/3"
+FORMAT = "usdfab-match/4"
 LONGEST_STEP = 2.0
 DAMPINGS = (0.01, 0.1, 1.0, 10.0)
 """Tried one after another until a step leads down; each iteration begins with the one that last did."""
@@ -67,7 +67,7 @@ class MatchSettings:
     prior:
         Weight of the prior, see ``match_steps.damped_step``.
     free:
-        Names of ``match_space.MOVES``, and ``exposure``.
+        Names of ``match_space.MOVES``, ``exposure``, and ``blur``, which only moves where the rig is not known.
     seed:
         Of the renders.
     """
@@ -79,14 +79,15 @@ class MatchSettings:
     levels: tuple[int, ...] = (1, 2, 4)
     kind: Kind = "gram"
     prior: float = 0.004
-    free: tuple[str, ...] = (*MOVES, EXPOSURE)
+    free: tuple[str, ...] = (*MOVES, *OF_THE_CAMERA)
     seed: int = 0
 
     @property
     def pictures(self) -> int:
         """How many pictures are rendered at most, about."""
         systems, channels = 2, 3
-        coordinates = systems * (len(self.free) + (channels - 1 if "albedo" in self.free else 0))
+        moving = [name for name in self.free if name not in OF_THE_CAMERA]
+        coordinates = systems * (len(moving) + (channels - 1 if "albedo" in moving else 0))
         looks = 1 + sum(map(len, questions(self.shapes, rig_known=False)))
         return looks + self.iterations * (coordinates + self.steps * len(DAMPINGS))
 
@@ -98,7 +99,7 @@ class MatchSettings:
 
 DRAFTED = (
     "radius", "flattening", "crimp", "twist", "waviness", "irregularity", "flyaway_density", "albedo_variation",
-    "roughness_azimuthal", "albedo", EXPOSURE,
+    "roughness_azimuthal", "albedo", BLUR, EXPOSURE,
 )  # fmt: skip
 """What a draft moves: what one round can settle, and is seen at its resolution."""
 
@@ -117,7 +118,8 @@ class MatchResult:
     Parameters
     ----------
     fabric, exposure, rig:
-        The best point; what its picture under the rig is multiplied by to be as bright as the target.
+        The best point; what its picture under the rig is multiplied by to be as bright as the target. The rig's blur is
+        that of the photo.
     losses:
         Of the start and after each step that was taken.
     uncertainty:
@@ -222,7 +224,8 @@ def match_photo(
     deviations = state.deviations if state.deviations is not None else np.zeros(len(space.names))
     return MatchResult(
         space.fabric(state.point), space.exposure(state.point), tuple(state.losses),
-        {k: v for k, v in space.deviations(state.point, deviations).items() if v > 0.0}, interrupted, search.rig,
+        {k: v for k, v in space.deviations(state.point, deviations).items() if v > 0.0}, interrupted,
+        search.rig_at(state.point),
     )  # fmt: skip
 
 
@@ -240,7 +243,9 @@ class _Search:
         self.pictures, self.settings, self.fresh = pictures, settings, state is None
         self.start, self.rig = start, start.rig
         self.questions = questions(settings.shapes, rig_known)
-        self.space = MatchSpace.about(start.fabric, settings.free, exposure)
+        free = [name for name in settings.free if not (rig_known and name == BLUR)]
+        self.space = MatchSpace.about(start.fabric, free, exposure, start.rig.blur if start.rig else 0.0)
+        self.scale = settings.width / start.fabric.size[0]
         self.state = state or _State(0, np.zeros(len(self.space.names)), [])
         self._progress = progress or (lambda *_: None)
         self._each = len(self.space.names) + settings.steps * len(DAMPINGS)
@@ -277,7 +282,7 @@ class _Search:
         picture = self.pictures.picture(seen.fabric, seen.rig)
         mean = float(self.pictures.mean.mean()) / max(exposure * float(picture.mean()), 1e-6)
         for light in (*(mean * factor for factor in LIGHTS), *(() if answers else (1.0,))):
-            residuals = self.pictures.residuals(picture, exposure * light)
+            residuals = self.pictures.residuals(picture, exposure * light, blur_in_pixels(seen.rig, self.scale))
             loss = soft_l1(residuals, self.pictures.weights)
             if loss < self.loss:
                 self.picture, self.residuals, self.loss = picture, residuals, loss
@@ -286,8 +291,16 @@ class _Search:
 
     def _settle(self, exposure: float) -> None:
         seen = looks_at(self.start, self.questions, self.state.answers)
-        self.space = replace(self.space, start=seen.fabric, light=exposure * self.state.light)
+        blur = seen.rig.blur if seen.rig else 0.0
+        self.space = replace(self.space, start=seen.fabric, light=exposure * self.state.light, blur=blur)
         self.rig = seen.rig
+
+    def rig_at(self, point: Floats) -> Rig | None:
+        """Camera and lamps at a point; None is the paper's rig, which is sharp."""
+        blur = self.space.blur_at(point)
+        if self.rig is None and blur == 0.0:
+            return None
+        return replace(self.rig or rig_for(self.space.start.size), blur=blur)
 
     def round(self) -> None:
         """One round of finite differences, and the steps that follow from it."""
@@ -313,8 +326,8 @@ class _Search:
         for k, name in enumerate(self.space.names):
             ahead = self.state.point.copy()
             ahead[k] += 1.0
-            if name == EXPOSURE:
-                moved = self.pictures.residuals(self.picture, self.space.exposure(ahead))
+            if name in OF_THE_CAMERA:
+                moved = self._residuals(self.picture, ahead)
             else:
                 picture, moved, loss = self._look(ahead)
                 if loss < best.loss:
@@ -345,12 +358,16 @@ class _Search:
 
     def _look(self, point: Floats) -> tuple[Singles, Singles, float]:
         picture = self.pictures.picture(self.space.fabric(point), self.rig)
-        residuals = self.pictures.residuals(picture, self.space.exposure(point))
+        residuals = self._residuals(picture, point)
         prior = 0.5 * self.settings.prior * float(np.sum((point / self.space.spread) ** 2))
         loss = soft_l1(residuals, self.pictures.weights) + prior
         self._done += 1
         self._tell(min(loss, self.loss))
         return picture, residuals, loss
+
+    def _residuals(self, picture: Singles, point: Floats) -> Singles:
+        """Of a picture with the exposure and the blur of a point."""
+        return self.pictures.residuals(picture, self.space.exposure(point), self.scale * self.space.blur_at(point))
 
     def _tell(self, loss: float) -> None:
         self._progress(self._done, self.settings.pictures, loss)

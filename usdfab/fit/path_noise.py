@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, median_filter
 
+from usdfab.imaging.lens import through_lens
+
 Floats = NDArray[np.float64]
 
 LIMIT = 3.0
@@ -116,6 +118,27 @@ class Denoised:
     def transposed(self, adjoint: Floats) -> Floats:
         """As ``Cleaned``."""
         return _blurred(self.ratio * adjoint, SMOOTH)
+
+
+@dataclass(frozen=True, eq=False)
+class Photographed:
+    """A cleaned picture as a camera shows it, ``blur`` pixels from sharp (``imaging.lens``)."""
+
+    clean: Cleaned
+    blur: float
+
+    @property
+    def image(self) -> Floats:
+        """As ``Cleaned``."""
+        return through_lens(self.clean.image, self.blur)
+
+    def derivatives(self, jacobian: Floats) -> Floats:
+        """As ``Cleaned``."""
+        return through_lens(self.clean.derivatives(jacobian), self.blur)
+
+    def transposed(self, adjoint: Floats) -> Floats:
+        """As ``Cleaned``; the lens is its own transpose."""
+        return self.clean.transposed(through_lens(adjoint, self.blur))
 
 
 def spread(image: Floats, kept: Floats) -> Floats:

@@ -14,7 +14,7 @@ from usdfab.fabric import FabricParameters
 from usdfab.fit import stages
 from usdfab.fit.stages import StageOutcome
 from usdfab.fit.straighten import straightened
-from usdfab.usd.rig import Rig, rig_for, swatch_scene
+from usdfab.usd.rig import Rig, blur_in_pixels, rig_for, swatch_scene
 
 if TYPE_CHECKING:
     from usdfab.fit.path_result import PathResult
@@ -93,7 +93,7 @@ def run_path(
     seen = (target.shape[1] / scale, target.shape[0] / scale)
     result = refine_appearance(
         begin, target / np.float32(exposure), settings=settings,
-        scene=swatch_scene(begin, (rig or rig_for(start.size)).with_sample(seen)),
+        scene=swatch_scene(begin, (rig or rig_for(start.size)).with_sample(seen)), blur=blur_in_pixels(rig, scale),
         checkpoint=checkpoint, progress=lambda done, _, loss: say(f"path, loss {loss:.3f}", 1 + done, steps),
         keep_interrupted=True,
     )  # fmt: skip

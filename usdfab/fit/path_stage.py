@@ -25,7 +25,7 @@ from usdfab.fabric.optics import Optics, optics_of, with_optics
 from usdfab.fit.features import FeatureNet, fast_dtype, load_features
 from usdfab.fit.path_checkpoint import State, load_state, save_state
 from usdfab.fit.path_loss import PathLoss
-from usdfab.fit.path_noise import Cleaned, Denoised, Spread, spread
+from usdfab.fit.path_noise import Cleaned, Denoised, Photographed, Spread, spread
 from usdfab.fit.path_passes import Picture, RecycledPasses, Renderer, SeparatePasses, make_renderer
 from usdfab.fit.path_photo import photo_target, picture_size, reduced_photo
 from usdfab.fit.path_result import PathResult, chosen_point, uncertainty_of
@@ -33,6 +33,7 @@ from usdfab.fit.path_settings import PathSettings
 from usdfab.fit.path_space import OpticsSpace
 from usdfab.fit.path_steps import adam_step, anchor_loss, gradient_by_point, model_step
 from usdfab.imaging.denoise import check_denoiser, denoise
+from usdfab.imaging.lens import through_lens
 from usdfab.tracer.checkpoint import fingerprint
 from usdfab.usd.rig import swatch_scene
 from usdfab.usd.scene import Camera, Scene
@@ -69,6 +70,7 @@ def refine_appearance(
     *,
     scene: Scene | None = None,
     camera: Camera | None = None,
+    blur: float = 0.0,
     settings: PathSettings | None = None,
     net: FeatureNet | None = None,
     renderer: Renderer | None = None,
@@ -88,6 +90,8 @@ def refine_appearance(
         A rig with the fabric on it; by default ``swatch_scene(fabric)``.
     camera:
         By default the scene's first.
+    blur:
+        How sharp the photo is, in its own pixels: ``imaging.lens``.
     settings:
         By default those of the quality ``standard``.
     net:
@@ -123,6 +127,7 @@ def refine_appearance(
         small = Spread.of(small).image  # what is done to the render's highlights is done to the photo's
     loss = PathLoss(photo_target(small, net, settings.levels), fabric.weave.classify(), settings.weights)
     space = OpticsSpace.around(renderer.optics)
+    soft = blur * size[0] / photo.shape[1]
     passes: SeparatePasses | RecycledPasses = (
         RecycledPasses(renderer, settings)  # type: ignore[arg-type]
         if settings.passes == "recycled"
@@ -130,13 +135,14 @@ def refine_appearance(
     )
     state = State.begin(np.append(space.coordinates(space.start), 0.0), settings.rate)
     file = None if checkpoint is None else Path(checkpoint)
-    identity = "" if file is None else fingerprint(scene, camera, replace(settings, threads=None), np.asarray(photo))
+    job = (scene, camera, blur, replace(settings, threads=None), np.asarray(photo))
+    identity = "" if file is None else fingerprint(*job)
     if file is not None and file.exists():
         state, saved = load_state(file, identity)
         passes.restore(saved)
     before = state.iteration
     state = _optimise(
-        state, space, passes, loss, clean, small, settings, file, identity, progress, keep_interrupted
+        state, space, passes, loss, clean, soft, small, settings, file, identity, progress, keep_interrupted
     )  # fmt: skip
     point, least = chosen_point(state)
     found = renderer.optics.with_vector(space.vector(point[:-1]))
@@ -197,6 +203,7 @@ def _optimise(
     passes: SeparatePasses | RecycledPasses,
     loss: PathLoss,
     clean: Callable[[Picture], Cleaned],
+    blur: float,
     photo: Floats,
     settings: PathSettings,
     file: Path | None,
@@ -208,7 +215,7 @@ def _optimise(
     saved, kept = time.perf_counter(), passes.state()
     try:
         while state.iteration < settings.iterations:
-            state = _step(state, space, passes, loss, clean, photo, settings)
+            state = _step(state, space, passes, loss, clean, blur, photo, settings)
             kept = passes.state()
             if progress:
                 progress(state.iteration, settings.iterations, float(state.losses[-1, 0]))
@@ -230,6 +237,7 @@ def _step(
     passes: SeparatePasses | RecycledPasses,
     loss: PathLoss,
     clean: Callable[[Picture], Cleaned],
+    blur: float,
     photo: Floats,
     settings: PathSettings,
 ) -> State:
@@ -239,10 +247,12 @@ def _step(
     picture = passes.picture(vector, state.iteration)
     value, change, gradient, normal = None, np.zeros(len(point)), np.zeros(len(point)), state.curvature
     if picture.finite:
-        cleaned = clean(picture)
+        own = clean(picture)
+        cleaned = Photographed(own, blur)
         if settings.noise == "match":
             scaled = np.exp(point[-1]) * picture.noise
-            loss = loss.matched(photo, spread(scaled, cleaned.kept) if isinstance(cleaned, Spread) else scaled)
+            noise = spread(scaled, own.kept) if isinstance(own, Spread) else scaled
+            loss = loss.matched(photo, through_lens(noise, blur))
         value = loss(cleaned.image, float(point[-1]), vector[-8:-2].reshape(2, 3))
         if value.finite and isinstance(passes, RecycledPasses) and settings.steps == "model":
             jacobian = cleaned.derivatives(passes.jacobian)

@@ -146,6 +146,7 @@ def fit_photo(
         f"size from {photo.size_source}",
         light,
         *_lamps(rig, found_rig),
+        *_sharpness(rig, found_rig),
         *photo.notes,
         *_confidences(analysis),
         *warnings,
@@ -205,6 +206,13 @@ def _lamps(given: Rig | None, found: Rig | None) -> list[str]:
         f"the photo looks as if lit by a lamp {elevation:.0f} degrees above the cloth, from {side:.0f} degrees "
         "(0 is right, 90 up)"
     ]
+
+
+def _sharpness(given: Rig | None, found: Rig | None) -> list[str]:
+    if given is not None or found is None or found.blur == 0.0:
+        return []
+    how = "is blurred" if found.blur > 0.0 else "looks sharpened"
+    return [f"the photo {how} by about {1e6 * abs(found.blur):.0f} micrometres on the cloth"]
 
 
 def _confidences(analysis: PhotoAnalysis) -> list[str]:

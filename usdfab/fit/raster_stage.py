@@ -36,8 +36,9 @@ from usdfab.fit.texture import (
     residuals,
     texture_loss,
 )
+from usdfab.imaging.lens import through_lens_torch
 from usdfab.tracer.checkpoint import fingerprint
-from usdfab.usd.rig import Rig, sample_scene
+from usdfab.usd.rig import Rig, blur_in_pixels, sample_scene
 
 Floats = NDArray[np.float64]
 Quality = Literal["draft", "standard", "paper"]
@@ -180,7 +181,7 @@ def refine_by_raster(
     net:
         The feature network; the shipped one by default.
     rig:
-        Camera and point lights; None is the paper's.
+        Camera and point lights, and how sharp the camera is; None is the paper's, which is sharp.
     diffuse:
         k_d to start from, a number or (K, 3); by default what gives the render the target's mean colour.
     checkpoint, resume:
@@ -206,7 +207,7 @@ def refine_by_raster(
         state = load_state(checkpoint, job)
     else:
         state = first_state(parameters.vector())
-    picture_of = _Pictures(renderer, parameters, tie)
+    picture_of = _Pictures(renderer, parameters, tie, blur_in_pixels(rig, settings.width / fabric.size[0]))
     if settings.steps == "adam":
         state, interrupted = descend(
             _loss(picture_of, goal, settings), state, settings.iterations, settings.rate, parameters.free_names,
@@ -249,11 +250,12 @@ def _renderer(fabric: FabricParameters, settings: StageSettings, rig: Rig | None
 
 @dataclass(frozen=True, eq=False)
 class _Pictures:
-    """Pictures of a vector without bounds; ``tie`` gives k_d where C does."""
+    """Pictures of a vector without bounds; ``tie`` gives k_d where C does, ``blur`` is the camera's in pixels."""
 
     renderer: RasterRenderer
     parameters: Parameters
     tie: DiffuseMap | None
+    blur: float = 0.0
 
     def look(self, vector: torch.Tensor) -> tuple[Shapes, Look]:
         shapes, look = self.parameters.of(self.parameters.natural(vector))
@@ -262,7 +264,7 @@ class _Pictures:
     def __call__(self, vector: torch.Tensor) -> tuple[torch.Tensor, Look]:
         """(3, H, W), and what it shows."""
         shapes, look = self.look(vector)
-        return self.renderer.image(shapes, look).permute(2, 0, 1), look
+        return through_lens_torch(self.renderer.image(shapes, look).permute(2, 0, 1), self.blur), look
 
 
 def _loss(picture_of: _Pictures, goal: Target, settings: StageSettings) -> Callable[[torch.Tensor], torch.Tensor]:

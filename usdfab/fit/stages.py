@@ -16,8 +16,9 @@ from usdfab.fabric import FabricParameters
 from usdfab.fit.albedo import LADDER, PATHS, REFINEMENTS, brightness_curves, with_inverted_albedo
 from usdfab.fit.extra import require_fit_extra
 from usdfab.imaging import denoise
+from usdfab.imaging.lens import through_lens
 from usdfab.tracer import RenderSettings, Tracer
-from usdfab.usd.rig import Rig, sample_scene
+from usdfab.usd.rig import Rig, blur_in_pixels, sample_scene
 
 if TYPE_CHECKING:
     from usdfab.fit.features import FeatureNet
@@ -199,7 +200,7 @@ def traced_distance(
 ) -> float:
     """Texture and colour loss of the path-traced, denoised swatch against a target at the scale of ``settings``.
 
-    The swatch, under ``rig`` or the paper's, is multiplied by ``exposure``.
+    The swatch, under ``rig`` or the paper's, is multiplied by ``exposure`` and seen through the rig's camera.
     """
     import torch
 
@@ -209,7 +210,9 @@ def traced_distance(
     scene = sample_scene(fabric, rig)
     size = render_size(fabric, settings.width)
     render = Tracer(scene).render(scene.cameras[0], RenderSettings(size, spp=JUDGE_PATHS_PER_PIXEL, seed=seed))
-    shown = np.float32(exposure) * denoise(render.pixels, render.albedo, render.normal)
+    clean = denoise(render.pixels, render.albedo, render.normal)
+    blur = blur_in_pixels(rig, settings.width / fabric.size[0])
+    shown = np.float32(exposure) * np.maximum(through_lens(clean, blur), np.float32(0.0))
     with torch.no_grad():
         goal, image = (
             torch.from_numpy(np.ascontiguousarray(p, dtype=np.float32)).permute(2, 0, 1) for p in (target, shown)

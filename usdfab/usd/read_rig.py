@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import Usd, UsdGeom
 
 from usdfab.errors import UsdfabError
 from usdfab.usd.read_scene import read_scene
-from usdfab.usd.rig import Rig
+from usdfab.usd.rig import BLUR_ATTRIBUTE, Rig
 from usdfab.usd.scene import Camera, Light, Scene
+from usdfab.usd.stage import open_stage
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +30,8 @@ def read_rig(path: str | Path) -> Rig:
     """The rig on a stage: its first camera, all its lights, and the surface that the camera looks at.
 
     The camera's axis meets the sample in its middle, at a right angle; the picture's width and height there are
-    ``sample_size``. A camera's exposure goes into the strength of the lights.
+    ``sample_size``. A camera's exposure goes into the strength of the lights; its ``BLUR_ATTRIBUTE``, if it has one,
+    says how sharp its photos are.
 
     Raises
     ------
@@ -36,7 +39,8 @@ def read_rig(path: str | Path) -> Rig:
         As ``read_scene``; without camera, light or anything in view; for a camera that looks at the sample at a slant
         or through an offset film.
     """
-    scene = read_scene(path)
+    stage = open_stage(path)
+    scene = read_scene(stage)
     for kind, found in (("camera", scene.cameras), ("light", scene.lights)):
         if not found:
             raise UsdfabError(f"the rig has no {kind}", place=str(path), remedy="give it one")
@@ -57,8 +61,21 @@ def read_rig(path: str | Path) -> Rig:
     # A camera's numbers are singles: their rounding is no part of the size.
     width, depth = (float(f"{2.0 * height * float(t):.6g}") for t in camera.tan_half)
     return Rig(
-        (width, depth), camera_height=height, lights=tuple(_moved(light, to_rig, gain) for light in scene.lights)
-    )
+        (width, depth), camera_height=height, lights=tuple(_moved(light, to_rig, gain) for light in scene.lights),
+        blur=_blur(stage, camera, place),
+    )  # fmt: skip
+
+
+def _blur(stage: Usd.Stage, camera: Camera, place: str) -> float:
+    prim = stage.GetPrimAtPath(camera.path)
+    value = prim.GetAttribute(BLUR_ATTRIBUTE).Get()
+    if value is None:
+        return 0.0
+    if not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise UsdfabError(f"{value!r} is not a length", place=f"{place}.{BLUR_ATTRIBUTE}")
+    # In the units of the camera's own frame, which may be scaled into the stage's.
+    axis = UsdGeom.Imageable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default()).GetRow3(0)
+    return float(value) * axis.GetLength() * float(UsdGeom.GetStageMetersPerUnit(stage))
 
 
 def _sample_below(scene: Scene, camera: Camera, place: str) -> tuple[float, Floats]:

@@ -30,6 +30,8 @@ RIG_PATH = "/Rig"
 PLANE_FACTOR = 3.0
 """Side of the plane over the side of the view: light that enters outside the picture and scatters in is right."""
 MAX_LAMPS = 64
+BLUR_ATTRIBUTE = "usdfab:blur"
+"""Of a rig's camera, double, in the units of its own frame: ``Rig.blur``."""
 _LAMP_RADIUS = 1e-3
 _FOCAL_LENGTH = 50.0
 
@@ -53,6 +55,9 @@ class Rig:
         Direction from the camera's axis to the first lamp, radians from +x towards +y.
     lights:
         Lights of a measured rig, in its own frame (``read_rig``); they take the place of the lamps.
+    blur:
+        On the sample: how far the camera blurs (standard deviation) or, with a minus sign, how widely it sharpens, see
+        ``imaging.lens``. Pictures that are compared with its photos show it, scenes do not.
     """
 
     sample_size: tuple[float, float]
@@ -62,6 +67,7 @@ class Rig:
     lamps: int = 1
     azimuth: float = 0.0
     lights: tuple[Light, ...] | None = None
+    blur: float = 0.0
 
     def __post_init__(self) -> None:
         if len(self.sample_size) != 2:
@@ -76,6 +82,8 @@ class Rig:
                 raise UsdfabError(f"{value} is not a height above 0", place=name)
         if not math.isfinite(self.light_side):
             raise UsdfabError(f"{self.light_side} is not a length", place="light_side")
+        if not math.isfinite(self.blur):
+            raise UsdfabError(f"{self.blur} is not a length", place="blur")
         if not math.isfinite(self.azimuth):
             raise UsdfabError(f"{self.azimuth} is not an angle", place="azimuth")
         if not 1 <= self.lamps <= MAX_LAMPS:
@@ -194,6 +202,8 @@ def _define_camera(stage: Usd.Stage, path: Sdf.Path, rig: Rig) -> None:
     camera.CreateVerticalApertureAttr(2.0 * _FOCAL_LENGTH * rig.tan_half[1])
     camera.CreateClippingRangeAttr(Gf.Vec2f(0.01 * rig.camera_height, 100.0 * rig.camera_height))
     camera.CreateFocusDistanceAttr(rig.camera_height)
+    if rig.blur:
+        camera.GetPrim().CreateAttribute(BLUR_ATTRIBUTE, Sdf.ValueTypeNames.Double).Set(rig.blur)
     UsdGeom.Xformable(camera).AddTranslateOp().Set(Gf.Vec3d(0.0, 0.0, rig.camera_height))
 
 
@@ -220,6 +230,11 @@ def _define_plane(stage: Usd.Stage, path: Sdf.Path, rig: Rig) -> None:
         "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
     )  # fmt: skip
     st.Set([Gf.Vec2f(*map(float, c)) for c in uv])
+
+
+def blur_in_pixels(rig: Rig | None, pixels_per_meter: float) -> float:
+    """``Rig.blur`` at a picture's scale; the paper's rig, None, is sharp."""
+    return 0.0 if rig is None else rig.blur * pixels_per_meter
 
 
 def swatch_scene(
