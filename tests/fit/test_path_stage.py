@@ -20,11 +20,12 @@ from usdfab.fabric.optics import optics_of, with_optics
 from usdfab.fit import path_photo, path_stage
 from usdfab.fit.features import FeatureNet
 from usdfab.fit.path_loss import PathLoss, Weights
-from usdfab.fit.path_noise import Denoised, Spread, spread
+from usdfab.fit.path_noise import Denoised, Photographed, Spread, spread
 from usdfab.fit.path_passes import RecycledPasses, SeparatePasses
 from usdfab.fit.path_settings import PathSettings, settings_for
 from usdfab.fit.path_space import OpticsSpace
 from usdfab.fit.path_stage import refine_appearance, start_from_joint
+from usdfab.imaging.lens import through_lens
 from usdfab.usd.rig import swatch_scene
 
 TRUTH = cloth()
@@ -199,6 +200,19 @@ def test_cleaning_keeps_the_light_and_has_the_right_transpose(kind, photo) -> No
         assert spread(a, cleaned.kept).sum() == pytest.approx(a.sum(), abs=1e-9)
         calm = np.full((8, 8, 3), 0.5)
         np.testing.assert_array_equal(Spread.of(calm).image, calm)
+
+
+@pytest.mark.parametrize("blur", [1.1, -0.8])
+def test_a_photo_through_a_lens(blur, photo, net) -> None:
+    """The camera's blur goes with pictures and derivatives, so the optics come back; left out, they do not."""
+    a, b = np.random.default_rng(4).standard_normal((2, *photo.shape))
+    seen = Photographed(Spread.of(photo), blur)
+    assert np.vdot(seen.derivatives(a[None])[0], b) == pytest.approx(np.vdot(a, seen.transposed(b)), rel=1e-9)
+    blurred = through_lens(photo, blur)
+    for settings in (SMALL, ADAM):
+        result = refined(blurred, net, settings, blur=blur)
+        assert errors(result.fabric).max() < 0.03
+        assert errors(refined(blurred, net, settings).fabric).max() > 2.0 * errors(result.fabric).max()
 
 
 # --- interruptions ---

@@ -25,7 +25,8 @@ from usdfab.fit.raster_stage import (
     refine_by_raster,
     straightened,
 )
-from usdfab.usd.rig import swatch_scene
+from usdfab.imaging.lens import through_lens
+from usdfab.usd.rig import rig_for, swatch_scene
 
 YARN = YarnParameters(
     count=4, radius=2.4e-4, fiber_count=8, inclination=0.7, crimp=0.8, twist=0.1, flattening=1.2,
@@ -209,3 +210,14 @@ def test_a_small_target_is_refused(net: FeatureNet) -> None:
     with pytest.raises(UsdfabError, match="too few to be reduced"):
         refine_by_raster(CLOTH, np.full((4, 4, 3), 0.5), QUICK, net=net)
     assert set(QUALITIES) == {"draft", "standard", "paper"}
+
+
+def test_a_rig_whose_camera_is_not_sharp_blurs_the_pictures(net: FeatureNet) -> None:
+    """Known blur goes with every picture, and does not become a property of the cloth."""
+    target = through_lens(shown(CLOTH, 0.25), 1.0)
+    settings = replace(QUICK, iterations=1, free=("flattening",))
+    rig = rig_for(CLOTH.size)
+    soft = replace(rig, blur=1.0 * CLOTH.size[0] / settings.width)
+    sharp, blurred = (refine_by_raster(CLOTH, target, settings, net=net, rig=r, diffuse=0.25) for r in (rig, soft))
+    assert blurred.best_loss < 1e-3 < 0.1 * sharp.best_loss
+    np.testing.assert_allclose(blurred.render, through_lens(sharp.render, 1.0), atol=1e-5)
