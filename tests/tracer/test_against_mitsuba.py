@@ -75,5 +75,5 @@ def test_mean_and_blocks(mitsuba_scene, depth, spp):
 @pytest.mark.slow
 @pytest.mark.parametrize(("depth", "spp"), [(2, 2048), (3, 4096), (64, 8192)])
 def test_mean_and_blocks_closely(mitsuba_scene, depth, spp):
-    # With so many samples, `hair`'s error after many bounces shows in the blocks: 0.3 % of the mean, 1 % here and there.
+    # With so many samples, `hair`'s error after many bounces shows in the blocks.
     compare(mitsuba_scene, depth, spp, 0.004, blockwise=depth <= 3)
