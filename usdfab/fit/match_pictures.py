@@ -37,6 +37,7 @@ class MatchPictures:
 
     def __init__(self, target: Target, width: int, spp: int, seed: int) -> None:
         self.target, self.width, self.spp, self.seed = target, width, spp, seed
+        self._correction: Singles | None = None
         weights = []
         for statistic, upper in zip(target.statistics, self._upper(target.statistics), strict=True):
             # Symmetric matrices: each pair off the diagonal stands for two entries.
@@ -52,15 +53,32 @@ class MatchPictures:
     def _upper(statistics: tuple) -> list[tuple[NDArray, NDArray]]:
         return [np.triu_indices(s.shape[-1]) if s.ndim == 3 else (np.arange(s.shape[-1]),) * 2 for s in statistics]
 
-    def picture(self, fabric: FabricParameters, rig: Rig | None) -> Singles:
-        """(H, W, 3) linear, denoised, at exposure 1."""
+    def picture(self, fabric: FabricParameters, rig: Rig | None, spp: int | None = None) -> Singles:
+        """(H, W, 3) linear, denoised, at exposure 1; ``spp`` for another number of samples than the usual."""
         repeat = math.prod(fabric.repeat())
         # Statistics need only so many different crossings; each is fibers to build and to keep.
         fewer = replace(fabric, variants=max(1, min(fabric.variants, VARIED_CELLS // repeat)))
         scene = sample_scene(fewer, rig)
         size = (self.width, max(1, round(self.width * fabric.size[1] / fabric.size[0])))
-        render = Tracer(scene).render(scene.cameras[0], RenderSettings(size, spp=self.spp, seed=self.seed))
+        render = Tracer(scene).render(scene.cameras[0], RenderSettings(size, spp=spp or self.spp, seed=self.seed))
         return denoise(render.pixels, render.albedo, render.normal)
+
+    def corrected_by(self, fine: Singles, usual: Singles, exposure: float, blur: float) -> None:
+        """From now on correct residuals by what many samples change in a picture like those at hand.
+
+        A denoiser leaves less detail of few samples than of many: in a picture of twill with 4 samples per pixel the
+        statistics were 0.19 off those with 64 (the loss was 0.38). Much of that is the same for all pictures about one
+        fabric: with yarns 6 % thicker and crimp 15 % higher 0.20 was off, corrected by the first picture 0.10.
+
+        Parameters
+        ----------
+        fine, usual: (H, W, 3)
+            The same view with many samples, and with ``spp``.
+        exposure, blur:
+            As for :meth:`residuals`.
+        """
+        self._correction = None
+        self._correction = self.residuals(fine, exposure, blur) - self.residuals(usual, exposure, blur)
 
     def residuals(self, picture: Singles, exposure: float, blur: float = 0.0) -> Singles:
         """What differs at an exposure, through a camera whose blur is given in pixels (``imaging.lens``).
@@ -85,4 +103,5 @@ class MatchPictures:
                 parts.append(difference[upper] if difference.ndim == 2 else difference)
             color = rolled_off(image).mean(dim=(0, 2, 3)).numpy() - self.mean
             parts.append(color / max(float(self.mean.mean()), 1e-3))
-        return np.concatenate(parts).astype(np.float32)
+        found_all = np.concatenate(parts).astype(np.float32)
+        return found_all if self._correction is None else found_all + self._correction
