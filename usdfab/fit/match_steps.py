@@ -53,8 +53,10 @@ def damped_step(
 def broyden_update(jacobian: Singles, step: Floats, change: Singles) -> None:
     """Make ``jacobian`` (P, R) map ``step`` to the ``change`` (R,) that it caused, changed as little as possible.
 
-    Broyden 1965, in place.
+    Broyden 1965, in place. No step teaches nothing.
     """
     direction = step.astype(np.float32)
+    if not direction.any():
+        return
     miss = change - direction @ jacobian
     jacobian += np.outer(direction / float(direction @ direction), miss)
