@@ -229,17 +229,27 @@ class PictureWindow:
         self._mapper.SetInputData(image)
 
     def _slider(self, number: int, slider: Slider) -> Any:
-        top = 0.94 - 0.115 * number
-        ready: list[bool] = []
+        top = 0.97 - 0.1 * number
+        made: list[Any] = []
+
+        def name(value: float) -> str:
+            return f"{slider.title}   {value:.2f}"
 
         def moved(value: float) -> None:
-            if ready:  # it is called once when it is made
+            if made:  # it is called once when it is made
+                made[0].SetTitleText(name(value))
                 self._guarded(lambda: slider.moved(value))
 
         widget = self.plotter.add_slider_widget(
-            moved, (slider.low, slider.high), value=slider.value, title=slider.title, pointa=(0.02, top),
-            pointb=(0.20, top), title_height=0.014, slider_width=0.02, tube_width=0.004, fmt="%.2f", color=INK,
-            title_color=INK, interaction_event="always",
+            moved, (slider.low, slider.high), value=slider.value, title=name(slider.value),
+            pointa=(0.02, top), pointb=(0.20, top), title_height=0.018, slider_width=0.02, tube_width=0.003,
+            color=INK, title_color=INK, interaction_event="always",
         )  # fmt: skip
-        ready.append(True)
+        look = widget.GetRepresentation()
+        # The value is in the title: above the handle it would lie on the title of the slider above.
+        look.ShowSliderLabelOff()
+        look.SetSliderLength(0.012)
+        look.SetEndCapLength(0.003)
+        look.SetEndCapWidth(0.02)
+        made.append(look)
         return widget
