@@ -59,8 +59,8 @@ class MatchSettings:
     spp:
         Samples per pixel of each picture, before the denoiser.
     reference:
-        Samples per pixel of the pictures by which those are corrected, ``MatchPictures.corrected_by``, at the start,
-        after the first looks and before each round; not more than ``spp``: no correction.
+        Samples per pixel of the pictures by which those are corrected, ``MatchPictures.corrected_by``, when weave and
+        kind of yarn are chosen and before each round; not more than ``spp``: no correction.
     iterations:
         Rounds of finite differences.
     steps:
@@ -93,7 +93,7 @@ class MatchSettings:
         moving = [name for name in self.free if name not in OF_THE_CAMERA]
         coordinates = systems * (len(moving) + (channels - 1 if "albedo" in moving else 0))
         asked = questions(self.shapes, rig_known=False, weave_known=False)
-        looks = 1 + sum(map(len, asked)) + (2 if asked else 1) * self.worth
+        looks = 1 + sum(map(len, asked)) + (self.worth if asked else 0)
         return looks + self.iterations * (self.worth + coordinates + self.steps * len(DAMPINGS))
 
     @property
@@ -280,7 +280,6 @@ class _Search:
             return
         self._try((), exposure)
         state.losses.append(self.loss)
-        self._correct_looks(exposure)
         for number, question in enumerate(self.questions):
             before, kept = self.loss, state.answers
             state.answers = (*kept, -1)
@@ -288,9 +287,8 @@ class _Search:
                 self._try((*kept, answer), exposure)
             if self.loss < before:
                 state.losses.append(self.loss)
-                # Another weave, or another shape under other lamps: then all is different.
-                if number < GREAT_QUESTIONS:
-                    self._correct_looks(exposure)
+            if number == GREAT_QUESTIONS - 1:
+                self._correct_looks(exposure)
         self._settle(exposure)
 
     def _try(self, answers: tuple[int, ...], exposure: float) -> None:
