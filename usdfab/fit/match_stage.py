@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
 from usdfab.fit.match_looks import GREAT_QUESTIONS, Look, Seen, looks_at, questions
-from usdfab.fit.match_pictures import MatchPictures
+from usdfab.fit.match_pictures import CORRECTION_DRAWS, MatchPictures
 from usdfab.fit.match_space import BLUR, EXPOSURE, MOVES, OF_THE_CAMERA, MatchSpace
 from usdfab.fit.match_steps import broyden_update, damped_step, normal_equations, soft_l1
 from usdfab.fit.stage_file import load_stage, save_stage
@@ -59,7 +59,7 @@ class MatchSettings:
     spp:
         Samples per pixel of each picture, before the denoiser.
     reference:
-        Samples per pixel of the pictures by which those are corrected, ``MatchPictures.corrected_by``, when weave and
+        Samples per pixel of the pictures by which those are corrected, ``MatchPictures.correct_for``, when weave and
         kind of yarn are chosen and before each round; not more than ``spp``: no correction.
     iterations:
         Rounds of finite differences.
@@ -98,8 +98,8 @@ class MatchSettings:
 
     @property
     def worth(self) -> int:
-        """How many pictures a picture by which they are corrected takes as long as; 0 where there is none."""
-        return round(self.reference / self.spp) if self.reference > self.spp else 0
+        """How many pictures a correction takes as long as; 0 where there is none."""
+        return CORRECTION_DRAWS + round(self.reference / self.spp) if self.reference > self.spp else 0
 
     @property
     def shapes(self) -> bool:
@@ -316,9 +316,8 @@ class _Search:
         """Correct residuals from now on for what few samples do to pictures like the present one."""
         if not self.settings.worth:
             return
-        fine = self.pictures.picture(fabric, rig, self.settings.reference)
-        self.pictures.corrected_by(fine, self.picture, exposure, blur)
         before = soft_l1(self.residuals, self.pictures.weights)
+        self.pictures.correct_for(fabric, rig, self.settings.reference, exposure, blur)
         self.residuals = self.pictures.residuals(self.picture, exposure, blur)
         # The prior's part stays.
         self.loss += soft_l1(self.residuals, self.pictures.weights) - before
