@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, strategies as st
 from small_network import small_net
 
@@ -15,13 +14,11 @@ from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, YarnParameters, weave_from_name
 from usdfab.fit import features, match_space, match_stage
 from usdfab.fit.features import FeatureNet
-from usdfab.fit.match_pictures import MatchPictures
 from usdfab.fit.match_run import run_match
 from usdfab.fit.match_space import BLUR, BLUR_UNIT, EXPOSURE, MOVES, MatchSpace, Move
 from usdfab.fit.match_stage import MatchResult, MatchSettings, checked_match_quality, match_photo
 from usdfab.fit.match_steps import SOFT, broyden_update, damped_step, normal_equations, soft_l1
 from usdfab.fit.raster_stage import StageSettings
-from usdfab.fit.texture import Target
 from usdfab.imaging import denoise
 from usdfab.imaging.lens import through_lens
 from usdfab.tracer import RenderSettings, Tracer
@@ -29,7 +26,7 @@ from usdfab.usd.rig import rig_for, swatch_scene
 
 YARN = YarnParameters(count=3, radius=3e-4, fiber_count=6, albedo=(0.6, 0.4, 0.3), roughness_azimuthal=0.3)
 CLOTH = FabricParameters(weave_from_name("plain"), (2e-3, 2e-3), YARN, replace(YARN, albedo=(0.3, 0.5, 0.7)))
-SMALL = MatchSettings(width=32, spp=16, reference=16, iterations=2, steps=3, levels=(1,), free=("albedo",), prior=1e-4)
+SMALL = MatchSettings(width=32, spp=16, iterations=2, steps=3, levels=(1,), free=("albedo",), prior=1e-4)
 
 
 @pytest.fixture(scope="module")
@@ -264,40 +261,3 @@ def test_blur_moves_through_sharp_and_stops() -> None:
     beyond = MatchSpace.about(CLOTH, (BLUR,), blur=3 * unit)
     assert beyond.blur_at(np.zeros(1)) == 3 * unit
     assert beyond.blur_at(np.array([-20.0])) == pytest.approx(2 * unit)
-
-
-# --- few samples ---
-
-
-def test_few_samples_are_corrected_by_many(net: FeatureNet) -> None:
-    """Pictures of 2 samples, corrected, are on the mean as those of 256; also those of a neighbour."""
-    pictures = MatchPictures(Target.from_image(torch.full((3, 32, 32), 0.3), net, (1,), "gram"), 32, 2, 0)
-    near = replace(CLOTH, weft=replace(CLOTH.weft, albedo=(0.4, 0.6, 0.75), radius=1.05 * CLOTH.weft.radius))
-    draws = range(20, 32)
-
-    def off() -> list[float]:
-        found = []
-        for cloth, fine in zip((CLOTH, near), many, strict=True):
-            few = [pictures.residuals(pictures.picture(cloth, None, draw=d), 1.0) for d in draws]
-            found.append(soft_l1(np.mean(few, axis=0) - fine, pictures.weights))
-        return found
-
-    many = [pictures.residuals(pictures.picture(cloth, None, 512, draw=40), 1.0) for cloth in (CLOTH, near)]
-    before = off()
-    pictures.correct_for(CLOTH, None, 256, 1.0, 0.0)
-    after = off()
-    assert after[0] < 0.6 * before[0] and after[1] < 0.6 * before[1], (before, after)
-
-
-def test_a_match_with_few_samples_is_corrected(goal: np.ndarray, net: FeatureNet) -> None:
-    settings = replace(SMALL, spp=2, free=("albedo", EXPOSURE), iterations=1)
-    plain, corrected = (
-        match_photo(CLOTH, goal, replace(settings, reference=r), net=net, exposure=1.2) for r in (2, 64)
-    )
-    assert corrected.losses[0] < 0.5 * plain.losses[0]
-    truth = np.log([*CLOTH.warp.albedo, *CLOTH.weft.albedo])
-
-    def off(result: MatchResult) -> float:
-        return float(abs(np.log([*result.fabric.warp.albedo, *result.fabric.weft.albedo]) - truth).mean())
-
-    assert off(corrected) < 0.7 * off(plain)

@@ -62,9 +62,6 @@ CLOSED_COVER = 1.04
 
 MOST_TWIST = 0.6
 
-GREAT_QUESTIONS = 3
-"""How many of the ``questions``, the first ones, change a picture altogether: the weave, and shapes with lamps."""
-
 
 @dataclass(frozen=True)
 class Seen:

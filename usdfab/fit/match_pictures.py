@@ -24,10 +24,6 @@ VARIED_CELLS = 16
 """Crossings of all variants of the repeat together beyond which pictures show fewer variants."""
 
 
-CORRECTION_DRAWS = 3
-"""Pictures of the usual number of samples whose mean is held against one of many, see ``correct_for``."""
-
-
 class MatchPictures:
     """Pictures of fabrics, and how their statistics differ from the target's.
 
@@ -41,7 +37,6 @@ class MatchPictures:
 
     def __init__(self, target: Target, width: int, spp: int, seed: int) -> None:
         self.target, self.width, self.spp, self.seed = target, width, spp, seed
-        self._correction: Singles | None = None
         weights = []
         for statistic, upper in zip(target.statistics, self._upper(target.statistics), strict=True):
             # Symmetric matrices: each pair off the diagonal stands for two entries.
@@ -57,32 +52,15 @@ class MatchPictures:
     def _upper(statistics: tuple) -> list[tuple[NDArray, NDArray]]:
         return [np.triu_indices(s.shape[-1]) if s.ndim == 3 else (np.arange(s.shape[-1]),) * 2 for s in statistics]
 
-    def picture(self, fabric: FabricParameters, rig: Rig | None, spp: int | None = None, draw: int = 0) -> Singles:
-        """(H, W, 3) linear, denoised, at exposure 1; with another number of samples than usual, or other draws."""
+    def picture(self, fabric: FabricParameters, rig: Rig | None) -> Singles:
+        """(H, W, 3) linear, denoised, at exposure 1."""
         repeat = math.prod(fabric.repeat())
         # Statistics need only so many different crossings; each is fibers to build and to keep.
         fewer = replace(fabric, variants=max(1, min(fabric.variants, VARIED_CELLS // repeat)))
         scene = sample_scene(fewer, rig)
         size = (self.width, max(1, round(self.width * fabric.size[1] / fabric.size[0])))
-        render = Tracer(scene).render(scene.cameras[0], RenderSettings(size, spp or self.spp, seed=self.seed + draw))
+        render = Tracer(scene).render(scene.cameras[0], RenderSettings(size, spp=self.spp, seed=self.seed))
         return denoise(render.pixels, render.albedo, render.normal)
-
-    def correct_for(
-        self, fabric: FabricParameters, rig: Rig | None, reference: int, exposure: float, blur: float
-    ) -> None:
-        """From now on correct residuals by what ``reference`` samples per pixel change in pictures of a fabric.
-
-        A denoiser leaves less detail of few samples than of many: in a picture of twill with 4 samples per pixel the
-        statistics were 0.19 off those with 64 (the loss was 0.38). Much of that is the same for all pictures about one
-        fabric: with yarns 6 % thicker and crimp 15 % higher 0.20 was off, corrected by the first picture 0.10.
-
-        The usual pictures taken for this have draws of their own (``CORRECTION_DRAWS``): corrected by its own noise, a
-        fabric would look better than all around it.
-        """
-        self._correction = None
-        fine = self.residuals(self.picture(fabric, rig, reference, CORRECTION_DRAWS + 1), exposure, blur)
-        usual = [self.residuals(self.picture(fabric, rig, draw=k + 1), exposure, blur) for k in range(CORRECTION_DRAWS)]
-        self._correction = fine - np.mean(usual, axis=0, dtype=np.float32)
 
     def residuals(self, picture: Singles, exposure: float, blur: float = 0.0) -> Singles:
         """What differs at an exposure, through a camera whose blur is given in pixels (``imaging.lens``).
@@ -107,5 +85,4 @@ class MatchPictures:
                 parts.append(difference[upper] if difference.ndim == 2 else difference)
             color = rolled_off(image).mean(dim=(0, 2, 3)).numpy() - self.mean
             parts.append(color / max(float(self.mean.mean()), 1e-3))
-        found_all = np.concatenate(parts).astype(np.float32)
-        return found_all if self._correction is None else found_all + self._correction
+        return np.concatenate(parts).astype(np.float32)

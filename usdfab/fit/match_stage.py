@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
-from usdfab.fit.match_looks import GREAT_QUESTIONS, Look, Seen, looks_at, questions
-from usdfab.fit.match_pictures import CORRECTION_DRAWS, MatchPictures
+from usdfab.fit.match_looks import Look, Seen, looks_at, questions
+from usdfab.fit.match_pictures import MatchPictures
 from usdfab.fit.match_space import BLUR, EXPOSURE, MOVES, OF_THE_CAMERA, MatchSpace
 from usdfab.fit.match_steps import broyden_update, damped_step, normal_equations, soft_l1
 from usdfab.fit.stage_file import load_stage, save_stage
@@ -58,9 +58,6 @@ class MatchSettings:
         Pixels along x of the pictures that are compared.
     spp:
         Samples per pixel of each picture, before the denoiser.
-    reference:
-        Samples per pixel of the pictures by which those are corrected, ``MatchPictures.correct_for``, when weave and
-        kind of yarn are chosen and before each round; not more than ``spp``: no correction.
     iterations:
         Rounds of finite differences.
     steps:
@@ -77,7 +74,6 @@ class MatchSettings:
 
     width: int = 240
     spp: int = 4
-    reference: int = 32
     iterations: int = 2
     steps: int = 3
     levels: tuple[int, ...] = (1, 2, 4)
@@ -92,14 +88,8 @@ class MatchSettings:
         systems, channels = 2, 3
         moving = [name for name in self.free if name not in OF_THE_CAMERA]
         coordinates = systems * (len(moving) + (channels - 1 if "albedo" in moving else 0))
-        asked = questions(self.shapes, rig_known=False, weave_known=False)
-        looks = 1 + sum(map(len, asked)) + (self.worth if asked else 0)
-        return looks + self.iterations * (self.worth + coordinates + self.steps * len(DAMPINGS))
-
-    @property
-    def worth(self) -> int:
-        """How many pictures a correction takes as long as; 0 where there is none."""
-        return CORRECTION_DRAWS + round(self.reference / self.spp) if self.reference > self.spp else 0
+        looks = 1 + sum(map(len, questions(self.shapes, rig_known=False, weave_known=False)))
+        return looks + self.iterations * (coordinates + self.steps * len(DAMPINGS))
 
     @property
     def shapes(self) -> bool:
@@ -114,9 +104,9 @@ DRAFTED = (
 """What a draft moves: what one round can settle, and is seen at its resolution."""
 
 QUALITIES: dict[str, MatchSettings] = {
-    "draft": MatchSettings(width=192, spp=4, reference=24, iterations=1, free=DRAFTED),
+    "draft": MatchSettings(width=192, spp=4, iterations=1, free=DRAFTED),
     "standard": MatchSettings(),
-    "paper": MatchSettings(width=360, spp=16, reference=64, iterations=4, levels=(1, 2, 4)),
+    "paper": MatchSettings(width=360, spp=16, iterations=4, levels=(1, 2, 4)),
 }
 """What ``--quality`` means here."""
 
@@ -265,7 +255,7 @@ class _Search:
         self.scale = settings.width / start.fabric.size[0]
         self.state = state or _State(0, np.zeros(len(self.space.names)), [])
         self._progress = progress or (lambda *_: None)
-        self._each = settings.worth + len(self.space.names) + settings.steps * len(DAMPINGS)
+        self._each = len(self.space.names) + settings.steps * len(DAMPINGS)
         self._done = self.state.round * self._each
         self.loss = math.inf
         self._seen: list[Seen] = []
@@ -280,15 +270,13 @@ class _Search:
             return
         self._try((), exposure)
         state.losses.append(self.loss)
-        for number, question in enumerate(self.questions):
+        for question in self.questions:
             before, kept = self.loss, state.answers
             state.answers = (*kept, -1)
             for answer in range(len(question)):
                 self._try((*kept, answer), exposure)
             if self.loss < before:
                 state.losses.append(self.loss)
-            if number == GREAT_QUESTIONS - 1:
-                self._correct_looks(exposure)
         self._settle(exposure)
 
     def _try(self, answers: tuple[int, ...], exposure: float) -> None:
@@ -308,23 +296,6 @@ class _Search:
                 self.state.answers, self.state.light = answers, light
         self._tell(self.loss)
 
-    def _correct_looks(self, exposure: float) -> None:
-        seen = looks_at(self.start, self.questions, self.state.answers)
-        self._correct(seen.fabric, seen.rig, exposure * self.state.light, blur_in_pixels(seen.rig, self.scale))
-
-    def _correct(self, fabric: FabricParameters, rig: Rig | None, exposure: float, blur: float) -> None:
-        """Correct residuals from now on for what few samples do to pictures like the present one."""
-        if not self.settings.worth:
-            return
-        before = soft_l1(self.residuals, self.pictures.weights)
-        self.pictures.correct_for(fabric, rig, self.settings.reference, exposure, blur)
-        self.residuals = self.pictures.residuals(self.picture, exposure, blur)
-        # The prior's part stays.
-        self.loss += soft_l1(self.residuals, self.pictures.weights) - before
-        self.state.losses[-1] = self.loss
-        self._done += self.settings.worth
-        self._tell(self.loss)
-
     def _settle(self, exposure: float) -> None:
         seen = looks_at(self.start, self.questions, self.state.answers)
         blur = seen.rig.blur if seen.rig else 0.0
@@ -342,10 +313,6 @@ class _Search:
         """One round of finite differences, and the steps that follow from it."""
         state, settings = self.state, self.settings
         before = self._done
-        here = state.point
-        self._correct(
-            self.space.fabric(here), self.rig, self.space.exposure(here), self.scale * self.space.blur_at(here)
-        )
         jacobian, nearby = self._jacobian()
         for step in range(settings.steps):
             matrix, gradient = normal_equations(self.residuals, jacobian, self.pictures.weights)
