@@ -27,6 +27,9 @@ SECONDS_PER_SAMPLE, SECONDS_PER_ITERATION = 2e-4, 4.0
 ITERATIONS_PER_ROUND = 10
 """A round of Gauss-Newton renders some 35 pictures without derivatives: as long as so many of Adam's iterations."""
 
+SECONDS_PER_TRACED_SAMPLE = 1.6e-5
+"""Of the path-traced pictures beside the raster stage's, about."""
+
 SECONDS_PER_MILLION_PATHS, SECONDS_PER_STEP = 10.0, 2.0
 """Of the path stage, about."""
 
@@ -128,6 +131,9 @@ class LaterStages:
                 samples = (self.raster.width * self.raster.supersampling) ** 2
                 each = ITERATIONS_PER_ROUND if self.raster.steps == "newton" else 1
                 work = self.raster.iterations * each * (SECONDS_PER_ITERATION + SECONDS_PER_SAMPLE * samples)
+                work += (
+                    SECONDS_PER_TRACED_SAMPLE * (1 + self.raster.iterations) * self.raster.traced * self.raster.width**2
+                )
             elif name == "network":
                 work = NETWORK_SECONDS
             elif name == "match" and self.match is not None:
