@@ -36,15 +36,15 @@ Singles = NDArray[np.float32]
 STEP = 0.1
 """Of the differences, in the space without bounds: 2.5 % of a range at its middle."""
 
-LONGEST = 1.0
+LONGEST = 2.0
 """No number moves farther in a round, in that space."""
 
 INNER_STEPS = 8
 """Reweightings in a step."""
 
-FIRST_DAMPING = 1e-3
+FIRST_DAMPING = 1e-2
 DAMPINGS = (0.1, 1.0, 10.0, 100.0)
-"""Tried in each round, times the last that was good; relative to the mean curvature."""
+"""Tried in each round, times the last that was good; relative to each number's curvature."""
 
 RETRY = 0.5
 """Part of a round's step that is looked at where the dear residuals refuse the whole."""
@@ -178,7 +178,7 @@ class _Search:
                 if loss < state.best_loss:
                     state = replace(
                         state, vector=there, trial=there, best=there, best_loss=loss, best_iteration=state.iteration,
-                        scale=max(damping, 1e-6), losses=(*state.losses, loss), notes=tuple(notes),
+                        scale=max(damping, 1e-4), losses=(*state.losses, loss), notes=tuple(notes),
                     )  # fmt: skip
                     return state, reached
         scale = state.scale * DAMPINGS[-1] * 10.0
@@ -234,15 +234,16 @@ def _least(
     """
     free = np.flatnonzero(~held)
     step = np.zeros(len(slope))
-    extra = 0.0
+    extra = np.zeros((len(slope), len(slope)))
     for k in range(INNER_STEPS if len(free) else 0):
         found = residuals if k == 0 else residuals + step.astype(np.float32) @ jacobian
         matrix, gradient = normal_equations(found, jacobian, weights)
         if k == 0:
-            inner = (matrix + bend)[np.ix_(free, free)]
-            extra = damping * max(np.trace(inner) / len(free), 1e-12)
-        matrix = matrix + bend + extra * np.eye(len(slope))
-        gradient = gradient + slope + bend @ step + extra * step
+            # Each number is damped by its own curvature: what a picture tells little of is not held by what it tells
+            # much of.
+            extra = damping * np.diag(np.maximum(np.diag(matrix + bend), 1e-12))
+        matrix = matrix + bend + extra
+        gradient = gradient + slope + bend @ step + extra @ step
         step[free] -= np.linalg.solve(matrix[np.ix_(free, free)], gradient[free])
         step = np.clip(step, -LONGEST, LONGEST)
     return step

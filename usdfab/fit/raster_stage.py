@@ -45,7 +45,7 @@ Quality = Literal["draft", "standard", "paper"]
 
 Steps = Literal["newton", "adam"]
 
-PRIOR_UNIT = 0.005
+PRIOR_UNIT = 0.002
 """Of the loss: twice what one standard deviation from a prior costs where steps are ``newton``. About what the loss
 gains, for each number, by following the chance of another draw of the fibers, which alone costs some .15."""
 
