@@ -27,6 +27,7 @@ from usdfab.fit.raster_stage import (
     refine_by_raster,
     straightened,
 )
+from usdfab.imaging import denoise
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import swatch_scene
 
@@ -100,9 +101,11 @@ def test_rounds_beside_path_traced_pictures_count_their_loss_and_resume(
 
     def traced(fabric: FabricParameters) -> np.ndarray:
         scene = swatch_scene(fabric)
-        return Tracer(scene).render(scene.cameras[0], RenderSettings((48, 48), spp=64, seed=1)).pixels
+        render = Tracer(scene).render(scene.cameras[0], RenderSettings((48, 48), spp=64, seed=1))
+        return denoise(render.pixels, render.albedo, render.normal)
 
-    target = traced(replace(CLOTH, seed=8))
+    # The same draws: others tell more of themselves in so small a picture than the crimp does.
+    target = traced(CLOTH)
     start = replace(CLOTH, warp=replace(CLOTH.warp, crimp=1.3), weft=replace(CLOTH.weft, crimp=1.3))
     settings = replace(ROUNDS, free=("crimp",), tied=True, traced=32)
     path = tmp_path / "raster.safetensors"
@@ -112,7 +115,12 @@ def test_rounds_beside_path_traced_pictures_count_their_loss_and_resume(
     assert rest.losses == whole.losses
     assert rest.fabric == whole.fabric
     assert whole.best_loss < whole.losses[0]
-    assert np.mean([abs(whole.fabric.system(s).crimp - 0.8) for s in ("warp", "weft")]) < 0.7 * 0.5
+    alone = refine_by_raster(start, target, replace(settings, traced=0), net=net)
+    near, far = (
+        np.mean([abs(r.fabric.system(s).crimp - 0.8) for s in ("warp", "weft")]) for r in (whole, alone)
+    )  # fmt: skip
+    assert near < 0.7 * 0.5
+    assert near < far
     with pytest.raises(UsdfabError, match="belongs to another"):
         refine_by_raster(start, target, replace(settings, traced=8), net=net, checkpoint=path, resume=True)
 

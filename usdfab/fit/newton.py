@@ -46,6 +46,10 @@ FIRST_DAMPING = 1e-2
 DAMPINGS = (0.1, 1.0, 10.0, 100.0)
 """Tried in each round, times the last that was good; relative to each number's curvature."""
 
+LEAST_DAMPING = 1e-4
+STEPS_TO_EXACT = 2
+"""Steps of a round, each with derivatives of its own, before exact residuals are looked at."""
+
 RETRY = 0.5
 """Part of a round's step that is looked at where the dear residuals refuse the whole."""
 
@@ -149,18 +153,42 @@ class _Search:
             return soft_l1(found, self._weights) + float(self._prior(vector))
 
     def round(self, state: State, place: _Place) -> tuple[State, _Place]:
-        """The state after the best of some damped steps, or the same place with more damping."""
-        here, notes = state.vector, list(state.notes)
-        jacobian, blind = self._jacobian(here, place.seen)
-        which = f"iteration {state.iteration}"
+        """The state after one step, or where there are exact residuals after some; or the same place with more
+        damping."""
+        notes = list(state.notes)
+        there, seen, loss, damping = state.vector, place.seen, state.best_loss, state.scale
+        for _ in range(1 if self._exact is None else STEPS_TO_EXACT):
+            found = self._step(there, seen, place, damping, f"iteration {state.iteration}", notes)
+            if found is None or not found[0] < loss:
+                break
+            loss, damping, there, seen = found
+        if there is not state.vector:
+            for part in (1.0,) if self._exact is None else (1.0, RETRY):
+                trial = state.vector + part * (there - state.vector)
+                reached = self.at(trial, seen if part == 1.0 else None)
+                loss = self.loss(trial, reached.true)
+                if loss < state.best_loss:
+                    state = replace(
+                        state, vector=trial, trial=trial, best=trial, best_loss=loss, best_iteration=state.iteration,
+                        scale=max(damping, LEAST_DAMPING), losses=(*state.losses, loss), notes=tuple(notes),
+                    )  # fmt: skip
+                    return state, reached
+        scale = state.scale * DAMPINGS[-1] * 10.0
+        return replace(state, scale=scale, losses=(*state.losses, state.best_loss), notes=tuple(notes)), place
+
+    def _step(
+        self, here: Tensor, seen: Singles, place: _Place, scale: float, which: str, notes: list[str]
+    ) -> tuple[float, float, Tensor, Singles] | None:
+        """The best of some damped steps: expected loss, damping, where it leads, residuals there."""
+        jacobian, blind = self._jacobian(here, seen)
         if blind:
             notes.append(f"{which}: the picture beside {few_names(blind)} was not finite: not moved in this round")
         slope, bend = self._prior_slopes(here)
         held = np.array([name in blind for name in self._names])
         best: tuple[float, float, Tensor, Singles] | None = None
         for factor in DAMPINGS:
-            damping = factor * state.scale
-            step = _least(place.true, jacobian, self._weights, slope, bend, damping, held)
+            damping = factor * scale
+            step = _least(self._expected(place, seen), jacobian, self._weights, slope, bend, damping, held)
             trial = here + torch.from_numpy(step)
             found = _numbers(self._residuals, trial)
             loss = self.loss(trial, self._expected(place, found))
@@ -169,20 +197,7 @@ class _Search:
                 notes.append(f"{which}: the loss, after {moved} moved most, was not finite; a shorter step instead")
             elif best is None or loss < best[0]:
                 best = loss, damping, trial, found
-        if best is not None and best[0] < state.best_loss:
-            _, damping, trial, found = best
-            for part in (1.0,) if self._exact is None else (1.0, RETRY):
-                there = here + part * (trial - here)
-                reached = self.at(there, found if part == 1.0 else None)
-                loss = self.loss(there, reached.true)
-                if loss < state.best_loss:
-                    state = replace(
-                        state, vector=there, trial=there, best=there, best_loss=loss, best_iteration=state.iteration,
-                        scale=max(damping, 1e-4), losses=(*state.losses, loss), notes=tuple(notes),
-                    )  # fmt: skip
-                    return state, reached
-        scale = state.scale * DAMPINGS[-1] * 10.0
-        return replace(state, scale=scale, losses=(*state.losses, state.best_loss), notes=tuple(notes)), place
+        return best
 
     def _expected(self, place: _Place, found: Singles) -> Singles:
         """The residuals that count where the others are ``found``."""

@@ -45,7 +45,7 @@ Quality = Literal["draft", "standard", "paper"]
 
 Steps = Literal["newton", "adam"]
 
-PRIOR_UNIT = 0.002
+PRIOR_UNIT = 0.005
 """Of the loss: twice what one standard deviation from a prior costs where steps are ``newton``. About what the loss
 gains, for each number, by following the chance of another draw of the fibers, which alone costs some .15."""
 
@@ -70,7 +70,7 @@ class StageSettings:
     steps:
         ``newton``: Gauss-Newton, see ``newton``; ``adam``: as the paper.
     iterations:
-        Adam's steps, or rounds of Gauss-Newton, each of which takes a picture for each number.
+        Adam's steps, or rounds of Gauss-Newton, each of which takes a picture for each number (two where ``traced``).
     rate:
         Size of Adam's steps in the space without bounds. The paper says 0.01 and not of what; there a number in the
         middle of its range moves by 0.25 % of the range, and at most by a fifth of it in 75 steps. With 0.03 what
@@ -114,9 +114,9 @@ class StageSettings:
 
 QUALITIES: dict[str, StageSettings] = {
     "draft": StageSettings(
-        width=128, supersampling=2, steps="newton", iterations=3, tied=True, traced=32, levels=(1, 2, 4), kind="gram"
+        width=128, supersampling=2, steps="newton", iterations=2, tied=True, traced=32, levels=(1, 2, 4), kind="gram"
     ),
-    "standard": StageSettings(steps="newton", iterations=4, tied=True, traced=16),
+    "standard": StageSettings(steps="newton", iterations=3, tied=True, traced=16),
     "paper": StageSettings(width=720),
 }
 """What ``--quality`` means here.
