@@ -37,7 +37,7 @@ STEP = 0.1
 """Of the differences, in the space without bounds: 2.5 % of a range at its middle."""
 
 LONGEST = 2.0
-"""No number moves farther in a round, in that space."""
+"""No number moves farther in a step, in that space."""
 
 INNER_STEPS = 8
 """Reweightings in a step."""
