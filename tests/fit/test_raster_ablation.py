@@ -87,7 +87,7 @@ def test_only_the_ablation_writes_files(tmp_path: Path) -> None:
 
 
 def test_one_weave_is_chosen_for_the_raster_stage_only() -> None:
-    with pytest.raises(UsdfabError, match="'tweed' is not judged.*plain, twill0, twill1, satin"):
+    with pytest.raises(UsdfabError, match=r"'tweed' is not judged.*plain, twill0, twill1, satin"):
         run("raster", weave="tweed")
     with pytest.raises(UsdfabError, match="takes no weave"):
         run("ablation", weave="plain")
