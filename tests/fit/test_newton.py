@@ -50,6 +50,12 @@ def test_a_prior_off_the_start_is_gone_to_where_nothing_else_tells() -> None:
     assert float(state.best[2]) == pytest.approx(0.8, abs=0.01)
 
 
+def test_what_neither_picture_nor_prior_tells_stays() -> None:
+    state, _ = gauss_newton(seen, WEIGHTS, lambda x: 0.0 * x.sum(), first_state(START), 8, NAMES)
+    assert torch.allclose(state.best[:2], TRUTH[:2], atol=0.01)
+    assert float(state.best[2]) == pytest.approx(float(START[2]), abs=1e-9)
+
+
 @pytest.mark.parametrize("stop", [1, 3])
 def test_resumed_is_undisturbed_bit_for_bit(tmp_path: Path, stop: int) -> None:
     whole, _ = gauss_newton(seen, WEIGHTS, prior, first_state(START), 5, NAMES)

@@ -256,7 +256,8 @@ def _least(
         if k == 0:
             # Each number is damped by its own curvature: what a picture tells little of is not held by what it tells
             # much of.
-            extra = damping * np.diag(np.maximum(np.diag(matrix + bend), 1e-12))
+            own = np.diag(matrix + bend)
+            extra = damping * np.diag(np.maximum(own, 1e-6 * own.mean() + 1e-12))
         matrix = matrix + bend + extra
         gradient = gradient + slope + bend @ step + extra @ step
         step[free] -= np.linalg.solve(matrix[np.ix_(free, free)], gradient[free])

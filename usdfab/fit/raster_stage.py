@@ -49,7 +49,7 @@ PRIOR_UNIT = 0.005
 """Of the loss: twice what one standard deviation from a prior costs where steps are ``newton``. About what the loss
 gains, for each number, by following the chance of another draw of the fibers, which alone costs some .15."""
 
-SPREADS = {"gain": 0.15}
+SPREADS = {"gain": 0.075}
 """Standard deviations of the priors about the start in the space without bounds; 1 for what is not here, a quarter of
 the range at its middle."""
 
