@@ -49,9 +49,12 @@ PRIOR_UNIT = 0.005
 """Of the loss: twice what one standard deviation from a prior costs where steps are ``newton``. About what the loss
 gains, for each number, by following the chance of another draw of the fibers, which alone costs some .15."""
 
-SPREADS = {"gain": 0.075}
+SPREADS = {
+    "gain": 0.075, "twist": 0.3, "roughness_longitudinal": 0.6, "roughness_azimuthal": 0.4, "roughness_primary": 0.5,
+}  # fmt: skip
 """Standard deviations of the priors about the start in the space without bounds; 1 for what is not here, a quarter of
-the range at its middle."""
+the range at its middle. Of twist and roughness, whose ranges are wide beside what cloth has, about a fifth of the width
+in Table 4 of Li et al. 2024."""
 
 START_DIFFUSE = (0.02, 0.9)
 """Range that k_d is given before the first iteration."""
