@@ -50,6 +50,12 @@ def test_a_prior_off_the_start_is_gone_to_where_nothing_else_tells() -> None:
     assert float(state.best[2]) == pytest.approx(0.8, abs=0.01)
 
 
+def test_what_neither_picture_nor_prior_tells_stays() -> None:
+    state, _ = gauss_newton(seen, WEIGHTS, lambda x: 0.0 * x.sum(), first_state(START), 8, NAMES)
+    assert torch.allclose(state.best[:2], TRUTH[:2], atol=0.01)
+    assert float(state.best[2]) == pytest.approx(float(START[2]), abs=1e-9)
+
+
 @pytest.mark.parametrize("stop", [1, 3])
 def test_resumed_is_undisturbed_bit_for_bit(tmp_path: Path, stop: int) -> None:
     whole, _ = gauss_newton(seen, WEIGHTS, prior, first_state(START), 5, NAMES)
@@ -102,3 +108,51 @@ def test_a_number_without_derivative_is_named_and_waits() -> None:
 def test_a_start_without_a_loss_is_refused() -> None:
     with pytest.raises(UsdfabError, match="not finite at the start"):
         gauss_newton(lambda x: seen(x) * torch.nan, WEIGHTS, prior, first_state(START), 2, NAMES)
+
+
+def displaced(x: Tensor) -> Tensor:
+    """Like ``seen``, with another place of its least."""
+    return seen(x) + 0.3 * torch.tanh(MATRIX[:, 0]).float()
+
+
+def test_a_wrong_model_beside_the_right_one_does_not_displace_the_least() -> None:
+    looked: list[Tensor] = []
+
+    def right(x: Tensor) -> Tensor:
+        looked.append(x)
+        return seen(x)
+
+    alone, _ = gauss_newton(displaced, WEIGHTS, prior, first_state(START), 6, NAMES)
+    assert float((alone.best[:2] - TRUTH[:2]).abs().max()) > 0.1
+    state, _ = gauss_newton(displaced, WEIGHTS, prior, first_state(START), 6, NAMES, exact=right)
+    assert torch.allclose(state.best[:2], TRUTH[:2], atol=0.01)
+    # The right one is looked at once at the start and at most twice in a round.
+    assert len(looked) <= 1 + 2 * 6
+
+
+def test_what_the_right_model_refuses_is_halved_or_left() -> None:
+    far = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    small = torch.eye(3, dtype=torch.float64)
+    weights = torch.ones(3)
+
+    def quick(x: Tensor) -> Tensor:
+        return (small @ (x - far)).float()
+
+    halved, _ = gauss_newton(
+        quick, weights, lambda x: 0.0 * x.sum(), first_state(0.0 * far), 1, NAMES,
+        exact=lambda x: quick(x) if x[0] < 0.8 else quick(0.0 * x),
+    )  # fmt: skip
+    assert float(halved.best[0]) == pytest.approx(0.5, abs=0.02)
+    left, _ = gauss_newton(
+        quick, weights, lambda x: 0.0 * x.sum(), first_state(0.0 * far), 2, NAMES, exact=lambda x: quick(-x)
+    )
+    assert torch.equal(left.best, 0.0 * far)
+    assert left.losses[-1] == left.losses[0]
+
+
+def test_resumed_beside_the_right_model_is_undisturbed(tmp_path: Path) -> None:
+    whole, _ = gauss_newton(displaced, WEIGHTS, prior, first_state(START), 4, NAMES, exact=seen)
+    path = tmp_path / "state.safetensors"
+    gauss_newton(displaced, WEIGHTS, prior, first_state(START), 2, NAMES, exact=seen, checkpoint=path, job="j")
+    rest, _ = gauss_newton(displaced, WEIGHTS, prior, load_state(path, "j"), 4, NAMES, exact=seen)
+    assert same(rest, whole)

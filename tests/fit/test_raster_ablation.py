@@ -86,6 +86,13 @@ def test_only_the_ablation_writes_files(tmp_path: Path) -> None:
         run("raster", output=tmp_path)
 
 
+def test_one_weave_is_chosen_for_the_raster_stage_only() -> None:
+    with pytest.raises(UsdfabError, match=r"'tweed' is not judged.*plain, twill0, twill1, satin"):
+        run("raster", weave="tweed")
+    with pytest.raises(UsdfabError, match="takes no weave"):
+        run("ablation", weave="plain")
+
+
 @pytest.mark.slow
 def test_ways_are_fitted_from_one_start_and_judged_alike(tmp_path: Path) -> None:
     net = small_net(tmp_path, torch.float32)

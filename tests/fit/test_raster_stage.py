@@ -14,10 +14,12 @@ from small_network import small_net
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, YarnParameters, weave_from_name
 from usdfab.fabric.optics import optics_of
+from usdfab.fit import raster_stage
 from usdfab.fit.features import FeatureNet
 from usdfab.fit.path_stage import start_from_joint
 from usdfab.fit.raster.renderer import RasterSettings, raster_renderer
 from usdfab.fit.raster.unconstrained import FREE_NAMES, parameters_of, soft_range, within_ranges
+from usdfab.fit.raster_multiple import measured_diffuse
 from usdfab.fit.raster_stage import (
     QUALITIES,
     StageSettings,
@@ -25,7 +27,9 @@ from usdfab.fit.raster_stage import (
     refine_by_raster,
     straightened,
 )
+from usdfab.imaging import denoise
 from usdfab.imaging.lens import through_lens
+from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import rig_for, swatch_scene
 
 YARN = YarnParameters(
@@ -89,6 +93,37 @@ def test_resumed_rounds_are_the_undisturbed_ones(net: FeatureNet, tmp_path: Path
     assert rest.losses == whole.losses
     assert rest.fabric == whole.fabric
     assert np.array_equal(rest.render, whole.render)
+
+
+def test_rounds_beside_path_traced_pictures_count_their_loss_and_resume(
+    net: FeatureNet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(raster_stage, "measured_diffuse", lambda *_: measured_diffuse(*_, paths=4000))
+
+    def traced(fabric: FabricParameters) -> np.ndarray:
+        scene = swatch_scene(fabric)
+        render = Tracer(scene).render(scene.cameras[0], RenderSettings((48, 48), spp=64, seed=1))
+        return denoise(render.pixels, render.albedo, render.normal)
+
+    # The same draws: others tell more of themselves in so small a picture than the crimp does.
+    target = traced(CLOTH)
+    start = replace(CLOTH, warp=replace(CLOTH.warp, crimp=1.3), weft=replace(CLOTH.weft, crimp=1.3))
+    settings = replace(ROUNDS, free=("crimp",), tied=True, traced=32)
+    path = tmp_path / "raster.safetensors"
+    refine_by_raster(start, target, replace(settings, iterations=1), net=net, checkpoint=path)
+    rest = refine_by_raster(start, target, settings, net=net, checkpoint=path, resume=True)
+    whole = refine_by_raster(start, target, settings, net=net)
+    assert rest.losses == whole.losses
+    assert rest.fabric == whole.fabric
+    assert whole.best_loss < whole.losses[0]
+    alone = refine_by_raster(start, target, replace(settings, traced=0), net=net)
+    near, far = (
+        np.mean([abs(r.fabric.system(s).crimp - 0.8) for s in ("warp", "weft")]) for r in (whole, alone)
+    )  # fmt: skip
+    assert near < 0.7 * 0.5
+    assert near < far
+    with pytest.raises(UsdfabError, match="belongs to another"):
+        refine_by_raster(start, target, replace(settings, traced=8), net=net, checkpoint=path, resume=True)
 
 
 def test_wrong_colours_and_exposure_come_back(net: FeatureNet) -> None:

@@ -22,6 +22,7 @@ def run(
     quality: Literal["draft", "standard", "paper"] = "draft",
     ablation: bool = False,
     fibers: int | None = None,
+    weave: str | None = None,
     output: OptionalOutput = None,
     overwrite: Overwrite = False,
     stages: str = "analysis,match",
@@ -78,6 +79,8 @@ def run(
         train the paper's network, on few materials, with and without its one-blob encoding and spatial fusion.
     fibers:
         Of raster and ablation: fibers in a yarn, instead of about 200, to save time.
+    weave:
+        Of raster: one of plain, twill0, twill1 and satin, instead of all four.
     output:
         Of ablation: a folder for its pictures (the target, then each way, side by side) and ablation.json. Of fits: a
         folder for each photo's asset, picture (photo, then each stage) and numbers. Of table2: such a folder too, with
@@ -95,6 +98,8 @@ def run(
     """
     if output is not None and what not in ("ablation", "fits", "table2", "surface", "neural"):
         raise UsdfabError(f"evaluate {what} writes no files", place="--output", remedy="leave it out")
+    if weave is not None and what != "raster":
+        raise UsdfabError(f"evaluate {what} takes no weave", place="--weave", remedy="leave it out")
     if what == "network":
         _network(folder, dataset, photos, analysis, json)
         return
@@ -120,7 +125,7 @@ def run(
             return
         count = 1 if count is None else count
         if what == "raster":
-            _raster(count, seed, quality, ablation, fibers, json)
+            _raster(count, seed, quality, ablation, fibers, weave, json)
         elif what == "ablation":
             _ablation(count, seed, quality, fibers, output, overwrite, json)
         else:
@@ -225,19 +230,24 @@ def _path(count: int, seed: int, quality: Literal["draft", "standard", "paper"],
         print(format_recoveries(results))
 
 
-def _raster(count: int, seed: int, quality: str, ablation: bool, fibers: int | None, json: bool) -> None:
+def _raster(
+    count: int, seed: int, quality: str, ablation: bool, fibers: int | None, weave: str | None, json: bool
+) -> None:
     from dataclasses import asdict
 
     from usdfab.fit.extra import require_fit_extra
 
     require_fit_extra("evaluate raster")
-    from usdfab.fit.raster_evaluation import ABLATIONS, evaluate_raster, format_recoveries
+    from usdfab.fit.raster_evaluation import ABLATIONS, WEAVES, evaluate_raster, format_recoveries
     from usdfab.fit.raster_stage import checked_quality
 
     ways = tuple(ABLATIONS) if ablation else ("full",)
+    if weave is not None and weave not in WEAVES:
+        raise UsdfabError(f"'{weave}' is not judged", place="--weave", remedy=f"use one of {', '.join(WEAVES)}")
     with progress_bar("Raster stage") as update:
         results = evaluate_raster(
-            count, seed, checked_quality(quality), ablations=ways, fibers=fibers, progress=update
+            count, seed, checked_quality(quality), weaves=WEAVES if weave is None else (weave,), ablations=ways,
+            fibers=fibers, progress=update,
         )  # fmt: skip
     if json:
         print_json({"recoveries": [asdict(r) for r in results]})

@@ -24,8 +24,12 @@ if TYPE_CHECKING:
 SECONDS_PER_SAMPLE, SECONDS_PER_ITERATION = 2e-4, 4.0
 """Of the raster stage, about."""
 
-ITERATIONS_PER_ROUND = 10
-"""A round of Gauss-Newton renders some 35 pictures without derivatives: as long as so many of Adam's iterations."""
+ITERATIONS_PER_STEP = 10
+"""A step of Gauss-Newton renders some 35 pictures without derivatives: as long as so many of Adam's iterations. A round
+has two where it also traces paths."""
+
+SECONDS_PER_TRACED_SAMPLE = 1.6e-5
+"""Of the path-traced pictures beside the raster stage's, about."""
 
 SECONDS_PER_MILLION_PATHS, SECONDS_PER_STEP = 10.0, 2.0
 """Of the path stage, about."""
@@ -130,8 +134,12 @@ class LaterStages:
         for name in self.names:
             if name == "raster" and self.raster is not None:
                 samples = (self.raster.width * self.raster.supersampling) ** 2
-                each = ITERATIONS_PER_ROUND if self.raster.steps == "newton" else 1
+                each = ITERATIONS_PER_STEP if self.raster.steps == "newton" else 1
+                each *= 2 if self.raster.traced else 1
                 work = self.raster.iterations * each * (SECONDS_PER_ITERATION + SECONDS_PER_SAMPLE * samples)
+                work += (
+                    SECONDS_PER_TRACED_SAMPLE * (1 + self.raster.iterations) * self.raster.traced * self.raster.width**2
+                )
             elif name == "network":
                 work = NETWORK_SECONDS
             elif name == "match" and self.match is not None:

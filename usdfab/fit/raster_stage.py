@@ -17,6 +17,7 @@ from usdfab.fabric.optics import optics_of
 from usdfab.fit.descent import Progress, State, descend, first_state, load_state
 from usdfab.fit.features import FeatureNet, fast_dtype, load_features
 from usdfab.fit.losses import roughness_prior
+from usdfab.fit.match_pictures import MatchPictures
 from usdfab.fit.newton import gauss_newton
 from usdfab.fit.raster.curves import Shapes
 from usdfab.fit.raster.multiple import DiffuseMap
@@ -45,13 +46,16 @@ Quality = Literal["draft", "standard", "paper"]
 
 Steps = Literal["newton", "adam"]
 
-PRIOR_UNIT = 0.02
-"""Of the loss: twice what one standard deviation from a prior costs where steps are ``newton``. Another draw of the
-fibers alone costs ten times that."""
+PRIOR_UNIT = 0.005
+"""Of the loss: twice what one standard deviation from a prior costs where steps are ``newton``. About what the loss
+gains, for each number, by following the chance of another draw of the fibers, which alone costs some .15."""
 
-SPREADS = {"gain": 0.15}
+SPREADS = {
+    "gain": 0.075, "twist": 0.3, "roughness_longitudinal": 0.6, "roughness_azimuthal": 0.4, "roughness_primary": 0.5,
+}  # fmt: skip
 """Standard deviations of the priors about the start in the space without bounds; 1 for what is not here, a quarter of
-the range at its middle."""
+the range at its middle. Of twist and roughness, whose ranges are wide beside what cloth has, about a fifth of the width
+in Table 4 of Li et al. 2024."""
 
 START_DIFFUSE = (0.02, 0.9)
 """Range that k_d is given before the first iteration."""
@@ -70,7 +74,7 @@ class StageSettings:
     steps:
         ``newton``: Gauss-Newton, see ``newton``; ``adam``: as the paper.
     iterations:
-        Adam's steps, or rounds of Gauss-Newton, each of which takes a picture for each number.
+        Adam's steps, or rounds of Gauss-Newton, each of which takes a picture for each number (two where ``traced``).
     rate:
         Size of Adam's steps in the space without bounds. The paper says 0.01 and not of what; there a number in the
         middle of its range moves by 0.25 % of the range, and at most by a fifth of it in 75 steps. With 0.03 what
@@ -79,6 +83,11 @@ class StageSettings:
         Whether k_d is the multiple scattering that follows from C, measured with the path tracer before the first
         iteration, see ``raster.multiple``, and as such stands in shadows, too; else it is found like the rest and
         shadowed like single scattering, as in the paper.
+    traced:
+        Paths per pixel of a path-traced, denoised picture of each round's start, whose losses count then: the raster
+        pictures' statistics are moved by how far they lie from its, so that what rasterization leaves out does not
+        displace the result, see ``newton``. 0 is without. Only for ``newton`` where k_d is ``tied``: else C is not that
+        of path tracing.
     texture, color, prior:
         Weights of the losses (eq. 11: all 1); 0 leaves one out. ``prior`` is for satin only, see ``losses``; where
         steps are ``newton`` it also holds what the picture does not tell near its start, in units of ``PRIOR_UNIT``.
@@ -96,6 +105,7 @@ class StageSettings:
     iterations: int = 75
     rate: float = 0.03
     tied: bool = False
+    traced: int = 0
     texture: float = 1.0
     color: float = 1.0
     prior: float = 1.0
@@ -108,9 +118,9 @@ class StageSettings:
 
 QUALITIES: dict[str, StageSettings] = {
     "draft": StageSettings(
-        width=128, supersampling=2, steps="newton", iterations=2, tied=True, levels=(1, 2, 4), kind="gram"
+        width=128, supersampling=2, steps="newton", iterations=2, tied=True, traced=32, levels=(1, 2, 4), kind="gram"
     ),
-    "standard": StageSettings(steps="newton", iterations=5, tied=True),
+    "standard": StageSettings(steps="newton", iterations=3, tied=True, traced=16),
     "paper": StageSettings(width=720),
 }
 """What ``--quality`` means here.
@@ -217,6 +227,7 @@ def refine_by_raster(
         state, interrupted = gauss_newton(
             _residuals(picture_of, goal), residual_weights(goal, settings.texture, settings.color),
             _prior(parameters, settings), state, settings.iterations, parameters.free_names,
+            exact=_traced(picture_of, goal, settings, rig) if settings.traced and tie is not None else None,
             checkpoint=checkpoint, job=job, progress=progress,
         )  # fmt: skip
     return _result(picture_of, state, interrupted)
@@ -289,6 +300,22 @@ def _residuals(picture_of: _Pictures, goal: Target) -> Callable[[torch.Tensor], 
     def found(vector: torch.Tensor) -> torch.Tensor:
         image, _ = picture_of(vector)
         return residuals(image, goal) if image.isfinite().all() else image.new_full((1,), torch.nan)
+
+    return found
+
+
+def _traced(
+    picture_of: _Pictures, goal: Target, settings: StageSettings, rig: Rig | None
+) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Residuals of the path-traced picture of a vector, at the exposure that it says, through the rig's camera."""
+    traced = MatchPictures(goal, settings.width, settings.traced, seed=0)
+
+    def found(vector: torch.Tensor) -> torch.Tensor:
+        parameters = picture_of.parameters
+        natural = parameters.natural(vector)
+        picture = traced.picture(parameters.fabric_of(natural), rig)
+        gain = float(parameters.of(natural)[1].gain)
+        return torch.from_numpy(traced.residuals(picture, gain, picture_of.blur))
 
     return found
 
