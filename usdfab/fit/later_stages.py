@@ -43,10 +43,6 @@ JUDGING_SECONDS = 15.0
 """What it takes, about, to find albedos and to judge a stage."""
 
 
-SURE_WEAVE = 0.8
-"""Confidence of the analysis from which its weave is not doubted: on 15 photos it was right from there."""
-
-
 @dataclass(frozen=True)
 class LaterStages:
     """Which stages follow the analysis, and how they work.
@@ -232,8 +228,7 @@ class LaterStages:
             assert self.match is not None
             return run_match(
                 last.fabric, photo, rotation, self.match, self.judge, exposure=last.exposure, rig=last.rig,
-                rig_known=self.rig is not None, weave_known=analysis.weave_confidence >= SURE_WEAVE,
-                distance=last.distance,
+                rig_known=self.rig is not None, distance=last.distance,
                 checkpoint=self.files.of(name) if self.files else None, progress=course.stage(name),
             )  # fmt: skip
         if any(last.fabric.system(system).albedo_variation > 0.0 for system in SYSTEMS):

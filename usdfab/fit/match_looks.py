@@ -14,12 +14,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
-from usdfab.fabric import SYSTEMS, FabricParameters, Weave, YarnParameters
+from usdfab.fabric import SYSTEMS, FabricParameters, YarnParameters
 from usdfab.fit.match_space import BLUR_UNIT
-from usdfab.fit.match_weaves import broken, with_floats
 from usdfab.usd.rig import Rig, rig_for, ring_rig
 
 RING_ELEVATIONS = (0.6,)
@@ -33,9 +31,6 @@ OTHER_ELEVATIONS = (0.45, 0.95)
 """Of the lamps found best, in a second look; they are turned, too."""
 
 TURNS = (0.25 * math.pi, -0.25 * math.pi)
-
-FLOATS = (1, 2, -2, -1)
-"""Ends in a row that a pick lies over, or under (negative), in the weaves that are looked at."""
 
 FULL: Mapping[str, float] = {
     "irregularity": 0.1, "crimp": 0.9, "inclination": 1.0, "unevenness": 0.1, "waviness": 0.12,
@@ -74,7 +69,7 @@ class Seen:
 Look = Callable[[Seen], Seen]
 
 
-def questions(shapes: bool, rig_known: bool, weave_known: bool = True) -> tuple[tuple[Look, ...], ...]:
+def questions(shapes: bool, rig_known: bool) -> tuple[tuple[Look, ...], ...]:
     """Looks by question.
 
     Parameters
@@ -84,17 +79,12 @@ def questions(shapes: bool, rig_known: bool, weave_known: bool = True) -> tuple[
         is soon as good.
     rig_known:
         Whether the rig is given, so that lamps are not asked for.
-    weave_known:
-        Whether the weave is sure, so that no other is asked for.
     """
     if not shapes:
         return ()
     lamps: tuple[Look, ...] = (_as_lit, *(() if rig_known else _lamps()))
     moved: tuple[Look, ...] = (*map(_elevated, OTHER_ELEVATIONS), *map(_turned, TURNS))
-    floats = tuple(_woven(partial(with_floats, over=n)) for n in FLOATS)
     return (
-        () if weave_known else floats,
-        () if weave_known else (_woven(broken),),
         # A lamp from the side suits only yarns that have sides, and closed cloth only lamps that show its valleys. So
         # these are asked for at once.
         tuple(_then(shape, lamp) for shape in (_full, _then(_full, _closed)) for lamp in lamps),
@@ -158,16 +148,6 @@ def _turned(angle: float) -> Look:
     def look(seen: Seen) -> Seen:
         rig = seen.rig or rig_for(seen.fabric.size)
         return Seen(seen.fabric, replace(rig, azimuth=rig.azimuth + angle) if rig.lamps == 1 else seen.rig)
-
-    return look
-
-
-def _woven(other: Callable[[Weave], Weave | None]) -> Look:
-    """Another weave of the same yarns, where there is one."""
-
-    def look(seen: Seen) -> Seen:
-        weave = other(seen.fabric.weave)
-        return seen if weave is None else Seen(replace(seen.fabric, weave=weave), seen.rig)
 
     return look
 

@@ -33,7 +33,6 @@ def run_match(
     exposure: float = 1.0,
     rig: Rig | None = None,
     rig_known: bool = False,
-    weave_known: bool = True,
     distance: float | None = None,
     checkpoint: Path | None = None,
     progress: Progress | None = None,
@@ -52,8 +51,6 @@ def run_match(
         How many times brighter the photo is than the start under the rig's standard light.
     rig, rig_known:
         Camera and lamps so far, None for the paper's, and whether the photo's are known.
-    weave_known:
-        Whether the start's weave is sure.
     distance:
         That of ``start``, where it is known.
     checkpoint:
@@ -80,8 +77,8 @@ def run_match(
     if before is None:
         before = stages.traced_distance(start, judged, judge, net, settings.seed, exposure, rig)
     result = match_photo(
-        start, goal, settings, net=net, exposure=exposure, rig=rig, rig_known=rig_known, weave_known=weave_known,
-        checkpoint=checkpoint, progress=lambda done, _, loss: say(f"match, loss {loss:.3f}", done, steps),
+        start, goal, settings, net=net, exposure=exposure, rig=rig, rig_known=rig_known, checkpoint=checkpoint,
+        progress=lambda done, _, loss: say(f"match, loss {loss:.3f}", done, steps),
     )  # fmt: skip
     notes = []
     if result.interrupted:
@@ -93,11 +90,6 @@ def run_match(
     if not after < before:
         notes.append(f"the match stage did not come closer to the photo ({before:.3f}, then {after:.3f}): not used")
         found, light, lamps, unsure = start, exposure, rig, {}
-    elif found.weave != start.weave:
-        read, seen = (
-            f"{w.classify()} {'/'.join(''.join(map(str, row)) for row in w.matrix)}" for w in (start.weave, found.weave)
-        )
-        notes.append(f"pictures of another weave ({seen}) come closer to the photo than of what was read ({read})")
     outcome = StageOutcome(
         "match", found, time.perf_counter() - begun, result.losses, min(before, after), tuple(notes),
         result.interrupted, exposure=light, rig=lamps, uncertainty=unsure,

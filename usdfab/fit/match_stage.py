@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
-from usdfab.fit.match_looks import Look, Seen, looks_at, questions
+from usdfab.fit.match_looks import Seen, looks_at, questions
 from usdfab.fit.match_pictures import MatchPictures
 from usdfab.fit.match_space import BLUR, EXPOSURE, MOVES, OF_THE_CAMERA, MatchSpace
 from usdfab.fit.match_steps import broyden_update, damped_step, normal_equations, soft_l1
@@ -88,7 +88,7 @@ class MatchSettings:
         systems, channels = 2, 3
         moving = [name for name in self.free if name not in OF_THE_CAMERA]
         coordinates = systems * (len(moving) + (channels - 1 if "albedo" in moving else 0))
-        looks = 1 + sum(map(len, questions(self.shapes, rig_known=False, weave_known=False)))
+        looks = 1 + sum(map(len, questions(self.shapes, rig_known=False)))
         return looks + self.iterations * (coordinates + self.steps * len(DAMPINGS))
 
     @property
@@ -169,7 +169,6 @@ def match_photo(
     exposure: float = 1.0,
     rig: Rig | None = None,
     rig_known: bool = False,
-    weave_known: bool = True,
     checkpoint: Path | None = None,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> MatchResult:
@@ -187,8 +186,6 @@ def match_photo(
         What pictures are multiplied by at the start, see ``albedo.photo_exposure``.
     rig, rig_known:
         Camera and lamps at the start (None: the paper's), and whether these are the photo's or only a first guess.
-    weave_known:
-        Whether the weave is sure, so that no other is looked at.
     checkpoint:
         A file that keeps the state after each round; if it is there and belongs to the same run, the run goes on from
         it to the same result. It is left there at the end.
@@ -208,14 +205,11 @@ def match_photo(
     pictures = MatchPictures(
         Target.from_image(picture, net, settings.levels, settings.kind), settings.width, settings.spp, settings.seed
     )
-    identity = fingerprint(
-        start, np.asarray(goal, dtype=np.float32), settings, float(exposure), rig, rig_known, weave_known
-    )
+    identity = fingerprint(start, np.asarray(goal, dtype=np.float32), settings, float(exposure), rig, rig_known)
     state = None
     if checkpoint is not None and checkpoint.exists():
         state = load_stage(checkpoint, FORMAT, identity, _state)
-    asked = questions(settings.shapes, rig_known, weave_known)
-    search = _Search(Seen(start, rig), asked, rig_known, exposure, pictures, settings, state, progress)
+    search = _Search(Seen(start, rig), rig_known, exposure, pictures, settings, state, progress)
     space, state = search.space, search.state
     interrupted = False
     try:
@@ -239,7 +233,6 @@ class _Search:
     def __init__(
         self,
         start: Seen,
-        asked: tuple[tuple[Look, ...], ...],
         rig_known: bool,
         exposure: float,
         pictures: MatchPictures,
@@ -249,7 +242,7 @@ class _Search:
     ) -> None:
         self.pictures, self.settings, self.fresh = pictures, settings, state is None
         self.start, self.rig = start, start.rig
-        self.questions = asked
+        self.questions = questions(settings.shapes, rig_known)
         free = [name for name in settings.free if not (rig_known and name == BLUR)]
         self.space = MatchSpace.about(start.fabric, free, exposure, start.rig.blur if start.rig else 0.0)
         self.scale = settings.width / start.fabric.size[0]
