@@ -82,7 +82,7 @@ def test_where_the_light_is_after_many_bounces(tmp_path):
     """Blocks of 4 x 4 pixels, each within its noise.
 
     With Mitsuba's `hair` instead of the plugin the mean is 0.3 % brighter, and the blocks' z scores have rms 1.4 to 1.6
-    (here 1.13): its last lobe again.
+    (here 1.13).
     """
     side, spp = 24, 8192
     theirs, scene, camera = both(fabric(fibers=8), 64, side, tmp_path)

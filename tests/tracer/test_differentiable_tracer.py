@@ -170,7 +170,7 @@ def test_each_parameter(lamp):
         if "ior" in name:
             # Light bends so strongly with the index that a difference over +-0.08 is 2 % below the derivative (and
             # over +-0.16, 7 %). Half the step leaves a quarter of that; more runs keep the noise where it was.
-            step, runs = step / 2, 48
+            step, runs = step / 2, 80
         d, dd = mean_and_error(finite_difference(tracer, step * np.eye(tracer.optics.size)[k], 64, runs))
         d, dd = d / step, dd / step
         both = np.hypot(error[k], dd)
