@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, strategies as st
 from scipy.ndimage import gaussian_filter
 
-from usdfab.imaging.lens import through_lens, through_lens_torch
+from usdfab.imaging.lens import photographed, through_lens, through_lens_torch
 
 PICTURE = np.random.default_rng(0).random((18, 27, 3))
 
@@ -47,6 +47,11 @@ def test_sharpening_is_the_other_side_of_blurring() -> None:
     assert through_lens(edge, -1.0).max() > 1.1 and through_lens(edge, -1.0).min() < -0.1
     # The grid ends the Gaussian's frequencies where they are 0.7 %: that much rings.
     assert through_lens(edge, 1.0).max() < 1.005
+
+
+def test_a_photo_is_not_below_black() -> None:
+    assert through_lens(PICTURE, -2.0).min() < 0.0 == photographed(PICTURE, -2.0).min()
+    np.testing.assert_array_equal(photographed(PICTURE, 2.0), through_lens(PICTURE, 2.0))
 
 
 def test_many_pictures_at_once_and_their_type() -> None:

@@ -17,7 +17,7 @@ from usdfab.fit.pipeline import Fit, fit_photo
 from usdfab.fit.result_folder import made_folder, no_result, read_result, write_result
 from usdfab.fit.straighten import straightened
 from usdfab.imaging import denoise, linear_to_srgb, side_by_side, srgb_to_linear, write_image
-from usdfab.imaging.lens import through_lens
+from usdfab.imaging.lens import photographed
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.fabric_io import write_fabric
 from usdfab.usd.rig import Rig, blur_in_pixels, sample_scene
@@ -191,7 +191,7 @@ def swatch(fabric: FabricParameters, seed: int = 0, rig: Rig | None = None) -> N
     size = (round(scale * fabric.size[0]), round(scale * fabric.size[1]))
     render = Tracer(scene).render(scene.cameras[0], RenderSettings(size, spp=SAMPLES, seed=seed + 1))
     clean = denoise(render.pixels, render.albedo, render.normal)
-    return np.maximum(through_lens(clean, blur_in_pixels(rig, scale)), np.float32(0.0))
+    return photographed(clean, blur_in_pixels(rig, scale))
 
 
 def _read_row(record: Path, about: dict[str, Any]) -> FitRow | None:

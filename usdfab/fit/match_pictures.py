@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from usdfab.fabric import FabricParameters
 from usdfab.imaging import denoise
-from usdfab.imaging.lens import through_lens
+from usdfab.imaging.lens import photographed
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import Rig, sample_scene
 
@@ -72,8 +72,7 @@ class MatchPictures:
         from usdfab.fit.texture import rolled_off, texture_statistics
 
         target = self.target
-        # Sharpening goes below black, which no photo does.
-        seen = np.maximum(through_lens(picture, blur), np.float32(0.0))
+        seen = photographed(picture, blur)
         with torch.inference_mode():
             image = torch.from_numpy(np.float32(exposure) * seen).permute(2, 0, 1)[None]
             found = texture_statistics(image, target.net, target.levels, target.kind)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from usdfab.errors import UsdfabError
-from usdfab.fabric import FabricParameters
 from usdfab.files import whole_file
 from usdfab.fit.comparison import difference
 from usdfab.fit.course import Course
@@ -18,10 +17,10 @@ from usdfab.fit.pipeline import Fit
 from usdfab.fit.report_page import report_page
 from usdfab.fit.straighten import straightened
 from usdfab.imaging import denoise, side_by_side, write_image
-from usdfab.imaging.lens import through_lens
+from usdfab.imaging.lens import photographed
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.drape import drape_scene
-from usdfab.usd.rig import Rig, blur_in_pixels, sample_scene
+from usdfab.usd.rig import blur_in_pixels, sample_scene
 
 HEIGHT = 480
 """Rows of the report's pictures."""
@@ -112,7 +111,12 @@ def write_report(
         )  # fmt: skip
         course.finish(name)
         clean = denoise(render.pixels, render.albedo, render.normal) if denoised else render.pixels
-        pictures[name] = clean if name == "drape" else fit.exposure * _photographed(clean, *shown[name])
+        if name == "drape":
+            pictures[name] = clean
+        else:
+            fabric, rig = shown[name]
+            blur = blur_in_pixels(rig, resolution[0] / fabric.size[0])
+            pictures[name] = np.float32(fit.exposure) * photographed(clean, blur)
     pictures["comparison"] = side_by_side([pictures["photo"], *(pictures[name] for name in shown)])
     scale = photo.shape[1] / fit.fabric.size[0]
     upright = straightened(fit.photo, fit.analysis.rotation, fit.photo.shape[1] / fit.fabric.size[0], scale)
@@ -127,12 +131,6 @@ def write_report(
     except OSError as error:
         raise UsdfabError(f"cannot be written ({error.strerror})", place=str(paths[PAGE])) from error
     return paths
-
-
-def _photographed(picture: NDArray[np.float32], fabric: FabricParameters, rig: Rig | None) -> NDArray[np.float32]:
-    """A picture of a whole fabric as the rig's camera shows it."""
-    seen = through_lens(picture, blur_in_pixels(rig, picture.shape[1] / fabric.size[0]))
-    return np.maximum(seen, np.float32(0.0))
 
 
 def loss_curve(losses: Sequence[float], size: tuple[int, int] = (480, 240)) -> NDArray[np.float32]:

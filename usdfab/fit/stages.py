@@ -16,7 +16,7 @@ from usdfab.fabric import FabricParameters
 from usdfab.fit.albedo import LADDER, PATHS, REFINEMENTS, brightness_curves, with_inverted_albedo
 from usdfab.fit.extra import require_fit_extra
 from usdfab.imaging import denoise
-from usdfab.imaging.lens import through_lens
+from usdfab.imaging.lens import photographed
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.rig import Rig, blur_in_pixels, sample_scene
 
@@ -212,7 +212,7 @@ def traced_distance(
     render = Tracer(scene).render(scene.cameras[0], RenderSettings(size, spp=JUDGE_PATHS_PER_PIXEL, seed=seed))
     clean = denoise(render.pixels, render.albedo, render.normal)
     blur = blur_in_pixels(rig, settings.width / fabric.size[0])
-    shown = np.float32(exposure) * np.maximum(through_lens(clean, blur), np.float32(0.0))
+    shown = np.float32(exposure) * photographed(clean, blur)
     with torch.no_grad():
         goal, image = (
             torch.from_numpy(np.ascontiguousarray(p, dtype=np.float32)).permute(2, 0, 1) for p in (target, shown)

@@ -40,6 +40,11 @@ def through_lens(picture: NDArray, blur: float) -> NDArray:
     return soft if blur > 0.0 else 2.0 * picture - soft
 
 
+def photographed(picture: NDArray, blur: float) -> NDArray:
+    """:func:`through_lens` as a photo shows it: sharpening goes below black, which no photo does."""
+    return np.maximum(through_lens(picture, blur), picture.dtype.type(0.0))
+
+
 def through_lens_torch(image: Any, blur: float) -> Any:
     """:func:`through_lens` of a torch tensor (..., C, H, W)."""
     if blur == 0.0:
