@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from pxr import Usd, UsdGeom, UsdLux
+from pxr import Sdf, Usd, UsdGeom, UsdLux
 
 from usdfab.errors import UsdfabError
 from usdfab.usd.check import check
@@ -195,7 +195,15 @@ def test_rigs_that_a_photo_cannot_have(tmp_path):
     def aside(stage):
         UsdGeom.Camera(stage.GetPrimAtPath("/Rig/Camera")).CreateHorizontalApertureOffsetAttr(3.0)
 
+    def endless(stage):
+        stage.GetPrimAtPath("/Rig/Camera").CreateAttribute("usdfab:blur", Sdf.ValueTypeNames.Double).Set(float("nan"))
+
+    def named(stage):
+        stage.GetPrimAtPath("/Rig/Camera").CreateAttribute("usdfab:blur", Sdf.ValueTypeNames.String).Set("soft")
+
     for name, change, words in (
+        ("g.usda", endless, "nan is not a length"),
+        ("h.usda", named, "'soft' is not a length"),
         ("a.usda", tilt, "3.0 degrees off its normal"),
         ("b.usda", aside, "offset film"),
         ("c.usda", lambda stage: stage.RemovePrim("/Rig/Lamp"), "no light"),
