@@ -99,6 +99,11 @@ def test_wanted_tiles_have_all_their_neighbours():
     assert tile_side(1280, 720) == 32
 
 
+def test_a_small_region_has_tiles_for_many_threads_and_noise_does_not_see_them():
+    assert len(plan_tiles(400, 400, (180, 180, 220, 220))) >= 25
+    assert plan_tiles(400, 400, (180, 180, 220, 220), adaptive=True)[0].window == (160, 160, 176, 176)
+
+
 @given(st.integers(1, 5000), st.integers(1, 5000))
 def test_passes_end_and_meet_every_power_of_two(spp, begin):
     count, seen = min(begin, spp), set()

@@ -25,7 +25,7 @@ from usdfab.scattering.fiber_numba import (
     sample_fiber_lobe,
 )
 from usdfab.tracer.counted import next_uniform, start_stream
-from usdfab.tracer.intrinsics import KERNEL, NG, PRIM, U, borrow, new_ray_buffer
+from usdfab.tracer.intrinsics import ENTRY, KERNEL, NG, PRIM, U, borrow, new_ray_buffer
 from usdfab.tracer.kernel import RUSSIAN_ROULETTE_DEPTH, SHADOW_ROULETTE
 from usdfab.tracer.slab import HIT, slab_occluded, trace_slab
 from usdfab.tracer.tangents import tangent_at
@@ -44,7 +44,7 @@ _TILES = 1024
 """Tiles in either direction among which a sample's is drawn: all variants and copies take their turns."""
 
 
-@njit(**KERNEL, nogil=True)
+@njit(**ENTRY, nogil=True)
 def answer_queries(
     addresses, borrowed_patches, systems, tile, up, queries, lights, first, samples, seed, max_depth, out
 ):  # fmt: skip

@@ -33,7 +33,7 @@ from usdfab.neural.simd import (
     where,
 )
 from usdfab.neural.simd_math import INLINE, dot, fraction, inverse_length
-from usdfab.tracer.intrinsics import KERNEL
+from usdfab.tracer.intrinsics import ENTRY
 from usdfab.tracer.lights import FAR, escaped_radiance, hit_light
 from usdfab.tracer.surfaces import MAX_SURFACES, surface_frame, trace_macro
 from usdfab.tracer.textures import lookup, opacity_at, surface_at
@@ -67,7 +67,7 @@ LEAST_COSINE = 0.02
 LONGEST = 2.0
 """A footprint's side is at least its longer axis over this: beyond, it would leave out too much of the ellipse."""
 
-OPTIONS: dict[str, Any] = {**KERNEL, "nogil": True}
+OPTIONS: dict[str, Any] = {**ENTRY, "nogil": True}
 
 
 class Cloth(NamedTuple):

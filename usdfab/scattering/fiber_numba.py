@@ -35,13 +35,21 @@ al., "Light Scattering from Human Hair Fibers", 2003 (Phi, the modified index); 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
 from usdfab.errors import UsdfabError
+from usdfab.scattering.elementary_numba import (
+    INLINED,
+    fast_asin,
+    fast_atan2,
+    fast_cos_half_turn,
+    fast_exp,
+    fast_log,
+    fast_sincos,
+)
 from usdfab.scattering.roughness import absorption_from_albedo, azimuthal_scale, lobe_variances
 
 __all__ = [
@@ -97,15 +105,6 @@ _INV_TWO_PI = 0.5 / math.pi
 _CUT = 40.0
 _U_MIN = 2.0**-54
 _U_MAX = 1.0 - 2.0**-53
-
-# No `nnan`, no `ninf`: the guards below must stay. No division check: none of the divisors can be zero. Inlined by
-# force, since LLVM finds the functions too large and would pass their tuples through memory: a third of the time.
-_OPTIONS: dict[str, Any] = {
-    "cache": True,
-    "error_model": "numpy",
-    "fastmath": {"contract", "nsz", "arcp"},
-    "forceinline": True,
-}
 
 
 def pack_fiber(
@@ -187,48 +186,6 @@ def pack_fiber(
     return p
 
 
-# --- Elementary functions ---
-#
-# Least-maximum polynomials that are inlined, two to five times as fast as calls of the C library, and with errors far
-# below what the model can be trusted with.
-
-
-@njit(**_OPTIONS)
-def _exp(x):
-    """e^x for x <= 0: relative error 5e-11, exactly 1 at 0, 1e-304 below -700."""
-    x = max(x, -700.0)
-    k = math.floor(x * 1.4426950408889634 + 0.5)
-    r = x - k * 0.6931471805599453
-    y = 0.0013945909115767692 + r * 0.00019767657325823942
-    y = 0.04166627239486353 + r * (0.008333568992028537 + r * y)
-    y = 0.5000000077192124 + r * (0.16666665162901595 + r * y)
-    y = 1.0 + r * (1.0000000002087592 + r * y)
-    # 2^k by its bits.
-    return y * np.int64((np.int64(k) + 1023) << 52).view(np.float64)
-
-
-@njit(**_OPTIONS)
-def _asin(x):
-    """Arc sine on [-1, 1]: pi/2 - sqrt(1 - |x|) P(|x|), odd; absolute error 3e-10, exact at 0 and +-1."""
-    a = abs(x)
-    y = 0.0028579613880584196 + a * -0.00048366825434151853
-    y = 0.01515279864710833 + a * (-0.008048713237337947 + a * y)
-    y = 0.033419934466777115 + a * (-0.023165743661482153 + a * y)
-    y = 0.0890466016949547 + a * (-0.05076014784747677 + a * y)
-    y = 0.5 * _PI + a * (-0.21460179349927908 + a * y)
-    return math.copysign(0.5 * _PI - math.sqrt(1.0 - a) * y, x)
-
-
-@njit(**_OPTIONS)
-def _cos_half_turn(u):
-    """cos(pi u) on [0, 1] as sin(pi (1/2 - u)): absolute error 2e-11."""
-    z = 0.5 - u
-    x = z * z
-    y = 0.08203123027860795 + x * -0.007000500565147764
-    y = 2.5501627947246344 + x * (-0.5992474049377746 + x * y)
-    return z * (3.1415926532437544 + x * (-5.167712741221726 + x * y))
-
-
 # --- The pieces that evaluation, sampling and density share ---
 
 BESSEL_SPLIT = 5.0
@@ -244,7 +201,7 @@ BESSEL_LARGE = (
 """I0(a) e^-a sqrt(a) above it: of the powers of 1 / a, relative error 2e-8."""
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _longitudinal(scale, inv_v, sin_i, cos_i, sin_o, cos_o):
     """M_p, per radian of theta_i over cos(theta_i): the integral of M_p cos(theta_i) over theta_i is 1.
 
@@ -265,23 +222,23 @@ def _longitudinal(scale, inv_v, sin_i, cos_i, sin_o, cos_o):
         bessel = c[4] + x * (c[5] + x * bessel)
         bessel = c[2] + x * (c[3] + x * bessel)
         bessel = c[0] + x * (c[1] + x * bessel)
-        return scale * _exp(b) * bessel
+        return scale * fast_exp(b) * bessel
     x = 1.0 / a
     c = BESSEL_LARGE
     bessel = c[6] + x * c[7]
     bessel = c[4] + x * (c[5] + x * bessel)
     bessel = c[2] + x * (c[3] + x * bessel)
     bessel = c[0] + x * (c[1] + x * bessel)
-    return scale * _exp(a + b) * bessel * math.sqrt(x)
+    return scale * fast_exp(a + b) * bessel * math.sqrt(x)
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _wrap(x):
     """An angle's equal in [-pi, pi]."""
     return x - _TWO_PI * math.floor(x * _INV_TWO_PI + 0.5)
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _azimuthal(p, x):
     """D, per radian: logistic density at the angle x (any), trimmed to [-pi, pi] and normalised there.
 
@@ -290,11 +247,11 @@ def _azimuthal(p, x):
     x = abs(_wrap(x)) * p[_INV_S]
     if x > _CUT:
         return 0.0
-    e = _exp(-x)
+    e = fast_exp(-x)
     return p[_D_SCALE] * e / ((1.0 + e) * (1.0 + e))
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _fresnel(cos_i, eta2_minus_1):
     """Unpolarised Fresnel reflectance of a dielectric from outside, 1 at grazing (cos_i = 0)."""
     g = math.sqrt(eta2_minus_1 + cos_i * cos_i)  # eta cos(theta_t)
@@ -304,7 +261,7 @@ def _fresnel(cos_i, eta2_minus_1):
     return 0.5 * (r_s * r_s + r_p * r_p)
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _attenuation(reflect, transmit):
     """A_TT, A_TRT and A_rest of one colour from F and T; A_R is F itself. With T = 1 the four sum to 1.
 
@@ -320,7 +277,7 @@ def _attenuation(reflect, transmit):
 # --- What the path tracer calls ---
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def load_fiber(materials, k):
     """Row k of an array of materials as a tuple, to be used as `p` in a kernel.
 
@@ -346,7 +303,7 @@ def load_fiber(materials, k):
     )
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def prepare_fiber(p, h, sin_to, cos_to):
     """Everything about a vertex that does not depend on the incident direction.
 
@@ -378,17 +335,17 @@ def prepare_fiber(p, h, sin_to, cos_to):
     cos_gamma_t = math.sqrt(1.0 - sin_gamma_t * sin_gamma_t)
 
     # Phi = 2 p gamma_t - 2 gamma_o + p pi; eval wraps differences, so whole turns are left out.
-    phi_r = -2.0 * _asin(h)
-    two_gamma_t = 2.0 * _asin(sin_gamma_t)
+    phi_r = -2.0 * fast_asin(h)
+    two_gamma_t = 2.0 * fast_asin(sin_gamma_t)
     phi_tt = phi_r + two_gamma_t + _PI
     phi_trt = phi_r + 2.0 * two_gamma_t
 
     # Attenuation: T = exp(-sigma_a 2 cos gamma_t / cos theta_t) over one crossing.
     length = 2.0 * cos_gamma_t * p[_ETA] / eta_cos_tt
     f = _fresnel(cos_to * cos_gamma_o, p[_ETA2_MINUS_1])
-    tt_r, trt_r, rest_r = _attenuation(f, _exp(-p[_SIGMA] * length))
-    tt_g, trt_g, rest_g = _attenuation(f, _exp(-p[_SIGMA + 1] * length))
-    tt_b, trt_b, rest_b = _attenuation(f, _exp(-p[_SIGMA + 2] * length))
+    tt_r, trt_r, rest_r = _attenuation(f, fast_exp(-p[_SIGMA] * length))
+    tt_g, trt_g, rest_g = _attenuation(f, fast_exp(-p[_SIGMA + 1] * length))
+    tt_b, trt_b, rest_b = _attenuation(f, fast_exp(-p[_SIGMA + 2] * length))
 
     # A lobe's probability is its share of the mean of the three colours: no weight can then exceed 3.
     tt = tt_r + tt_g + tt_b
@@ -410,7 +367,7 @@ def prepare_fiber(p, h, sin_to, cos_to):
     return (*tilted, phi_r, phi_tt, phi_trt, *colors, *probabilities)
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def eval_fiber(p, prep, sin_ti, cos_ti, phi):
     """Value of the BSDF times cosine in RGB, and the density with which `sample_fiber` takes the direction.
 
@@ -476,7 +433,7 @@ def eval_fiber(p, prep, sin_ti, cos_ti, phi):
     return red, green, blue, pdf
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def drawn_lobe(prep, u):
     """The lobe that a uniform number chooses, and the middle of its azimuth: 0 R, 1 TT, 2 TRT, 3 the rest."""
     if u < prep[21]:
@@ -488,7 +445,7 @@ def drawn_lobe(prep, u):
     return 3, 0.0
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _draw(p, prep, u0, u1, u2, u3):
     """A lobe by its share of the attenuation, then M_p and D_p exactly: (lobe, sin_ti, cos_ti, phi).
 
@@ -507,9 +464,9 @@ def _draw(p, prep, u0, u1, u2, u3):
     # Inclination. M is the distribution of sin(theta_i) of a direction spread around the mirror cone's -theta_o with
     # density ~ e^(cos(x) / v) (von Mises-Fisher): draw 1 - cos(x), then the way around, of which only the cosine
     # matters, so that half a turn is enough. 1 - e^(-2/v) is 1 / (v scale).
-    drop = -v * math.log(max(1.0 - u1 / (v * scale), _U_MIN))
+    drop = -v * fast_log(max(1.0 - u1 / (v * scale), _U_MIN))
     drop = min(drop, 2.0)
-    sin_ti = math.sqrt(drop * (2.0 - drop)) * _cos_half_turn(u2) * cos_o - (1.0 - drop) * sin_o
+    sin_ti = math.sqrt(drop * (2.0 - drop)) * fast_cos_half_turn(u2) * cos_o - (1.0 - drop) * sin_o
     sin_ti = min(max(sin_ti, -1.0), 1.0)
     cos_ti = math.sqrt(1.0 - sin_ti * sin_ti)
 
@@ -518,13 +475,13 @@ def _draw(p, prep, u0, u1, u2, u3):
         phi = _TWO_PI * u3 - _PI
     else:
         y = min(max(p[_D_BELOW] + u3 * p[_D_INSIDE], _U_MIN), _U_MAX)
-        x = p[_S] * math.log(y / (1.0 - y))
+        x = p[_S] * fast_log(y / (1.0 - y))
         phi = _wrap(center + min(max(x, -_PI), _PI))
 
     return lobe, sin_ti, cos_ti, phi
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def sample_fiber(p, prep, u0, u1, u2, u3):
     """Take an incident direction with density close to the value of the BSDF.
 
@@ -554,7 +511,7 @@ def sample_fiber(p, prep, u0, u1, u2, u3):
     return sin_ti, cos_ti, phi, red * inv_pdf, green * inv_pdf, blue * inv_pdf, pdf
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def sample_fiber_lobe(p, prep, u0, u1, u2, u3):
     """`sample_fiber` with the weight of the lobe that was drawn alone, for when nobody asks for the density.
 
@@ -583,7 +540,7 @@ def sample_fiber_lobe(p, prep, u0, u1, u2, u3):
 # --- Between world space and (theta, phi, h) ---
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def fiber_frame(ax, ay, az, nx, ny, nz, wx, wy, wz):
     """From a hit in world space to what `prepare_fiber` wants, and the frame of the normal plane.
 
@@ -639,7 +596,7 @@ def fiber_frame(ax, ay, az, nx, ny, nz, wx, wy, wz):
     return sin_to, cos_to, min(max(h, -1.0), 1.0), ex, ey, ez, fx, fy, fz
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def fiber_angles(ax, ay, az, ex, ey, ez, fx, fy, fz, wx, wy, wz):
     """From an incident direction in world space to the arguments of `eval_fiber`.
 
@@ -660,10 +617,10 @@ def fiber_angles(ax, ay, az, ex, ey, ez, fx, fy, fz, wx, wy, wz):
     sin_ti = min(max(wx * ax + wy * ay + wz * az, -1.0), 1.0)
     along_e = wx * ex + wy * ey + wz * ez
     along_f = wx * fx + wy * fy + wz * fz
-    return sin_ti, math.sqrt(1.0 - sin_ti * sin_ti), math.atan2(along_f, along_e)
+    return sin_ti, math.sqrt(1.0 - sin_ti * sin_ti), fast_atan2(along_f, along_e)
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def fiber_direction(ax, ay, az, ex, ey, ez, fx, fy, fz, sin_ti, cos_ti, phi):
     """From what `sample_fiber` gives to an incident direction in world space; the inverse of `fiber_angles`.
 
@@ -679,8 +636,9 @@ def fiber_direction(ax, ay, az, ex, ey, ez, fx, fy, fz, sin_ti, cos_ti, phi):
     wx, wy, wz: float
         Unit vector.
     """
-    along_e = cos_ti * math.cos(phi)
-    along_f = cos_ti * math.sin(phi)
+    sin_phi, cos_phi = fast_sincos(phi)
+    along_e = cos_ti * cos_phi
+    along_f = cos_ti * sin_phi
     wx = sin_ti * ax + along_e * ex + along_f * fx
     wy = sin_ti * ay + along_e * ey + along_f * fy
     wz = sin_ti * az + along_e * ez + along_f * fz

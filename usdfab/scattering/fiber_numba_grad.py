@@ -28,12 +28,12 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from usdfab.scattering.elementary_numba import INLINED
 from usdfab.scattering.fiber_numba import (
     _ETA,
     _INV_S,
     _INV_V,
     _M_SCALE,
-    _OPTIONS,
     _SIGMA,
     _SIN_TILT,
     BESSEL_LARGE,
@@ -116,7 +116,7 @@ def _log_variance_slope(g: float) -> float:
     return 2.0 * (0.726 + 1.624 * g + 74.0 * g**19) / (0.726 * g + 0.812 * g**2 + 3.7 * g**20)
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def load_slopes(slopes, k):
     """Row k of an array of ``pack_slopes`` as a tuple, see ``fiber_numba.load_fiber``."""
     m = slopes
@@ -125,7 +125,7 @@ def load_slopes(slopes, k):
     )  # fmt: skip
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def prepare_slopes(p, prep, h, cos_to):
     """How the attenuations and the angles of a vertex depend on the material.
 
@@ -168,7 +168,7 @@ def prepare_slopes(p, prep, h, cos_to):
     return length, length_slope, slope / f, slope / max(1.0 - f, _TINY), m_r, m_g, m_b, -tangent * by_eta
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _longitudinal_slope(inv_v, edge, sin_i, cos_i, sin_o, cos_o):
     """v d ln M / d v."""
     a = cos_i * cos_o * inv_v
@@ -199,7 +199,7 @@ def _longitudinal_slope(inv_v, edge, sin_i, cos_i, sin_o, cos_o):
     return (1.0 + sin_i * sin_o - cos_i * cos_o) * inv_v + u - 1.0 + edge
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _azimuthal_slopes(p, g, x):
     """(s d ln D / d s, d ln D / d Phi) at phi - Phi = x."""
     x = _wrap(x)
@@ -209,13 +209,13 @@ def _azimuthal_slopes(p, g, x):
     return y * t - 1.0 + g[_D_EDGE], math.copysign(t * p[_INV_S], x)
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _by_albedo(p, g, channel, by_sigma):
     """From a derivative by sigma to one by C; sigma = (ln C / q)^2."""
     return -2.0 * math.sqrt(p[_SIGMA + channel]) * g[_ROOT_BY_C + channel] * by_sigma
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def lobe_slopes(p, g, prep, slopes, u0, sin_ti, cos_ti, phi):
     """Logarithmic derivatives of what ``sample_fiber_lobe`` weighs: the one lobe that it drew, at a fixed direction.
 
@@ -277,7 +277,7 @@ def lobe_slopes(p, g, prep, slopes, u0, sin_ti, cos_ti, phi):
     ), (by_m, by_n * g[_S_BY_N], by_m0, by_phi * phi_slope)  # fmt: skip
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def eval_fiber_slopes(p, g, prep, slopes, sin_ti, cos_ti, phi):
     """Value and density of ``eval_fiber``, and the value's derivatives.
 

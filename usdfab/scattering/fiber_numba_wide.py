@@ -20,7 +20,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from usdfab.scattering.fiber_numba import _OPTIONS, _asin, _exp, _fresnel, _longitudinal
+from usdfab.scattering.elementary_numba import INLINED, fast_asin, fast_exp
+from usdfab.scattering.fiber_numba import _fresnel, _longitudinal
 from usdfab.scattering.fiber_numba_grad import _longitudinal_slope
 
 __all__ = ["TILTS_SIZE", "WIDE_SIZE", "tilts", "wide_lobes", "wide_lobes_slopes", "wide_slopes", "wide_value"]
@@ -42,13 +43,13 @@ def tilts(tilt: float) -> NDArray[np.float64]:
     return np.r_[np.sin(turn), np.cos(turn)]
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _turned(turn, k, sin_to, cos_to):
     sin, cos = turn[k], turn[4 + k]
     return sin_to * cos - cos_to * sin, abs(cos_to * cos + sin_to * sin)
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def wide_lobes(m, turn, sin_to, cos_to, sin_ti, cos_ti):
     """M_p of R, TT, TRT and the rest.
 
@@ -69,7 +70,7 @@ def wide_lobes(m, turn, sin_to, cos_to, sin_ti, cos_ti):
     return reflect, tt, trt, rest
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def wide_lobes_slopes(m, turn, sin_to, cos_to, sin_ti, cos_ti, lobes, adjoints, row):
     """Derivatives of a loss by the arguments of ``wide_lobes``: (sin_to, cos_to, sin_ti, cos_ti).
 
@@ -106,17 +107,17 @@ def wide_lobes_slopes(m, turn, sin_to, cos_to, sin_ti, cos_ti, lobes, adjoints, 
     return by_sin_to, by_cos_to, by_sin_ti, by_cos_ti
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _logistic(m, x):
     """(sigmoid of an angle over s, D there, the angle wrapped, its turns)."""
     turns = math.floor(x * _INV_TWO_PI + 0.5)
     y = x - 2.0 * math.pi * turns
-    e = _exp(-abs(y) * m[_INV_S])
+    e = fast_exp(-abs(y) * m[_INV_S])
     over = 1.0 / (1.0 + e)
     return (over if y >= 0.0 else e * over), m[_D_SCALE] * e * over * over, y, turns
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _mean(m, x0, x1):
     """Mean of D over the angles between x0 and x1 (any)."""
     width = x1 - x0
@@ -128,13 +129,13 @@ def _mean(m, x0, x1):
     return ((t1 - t0) + (s1 - s0) * (m[_D_SCALE] / m[_INV_S])) / width
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _mean_slopes(m, x0, x1):
     """(mean of D, its derivatives by x0, x1, 1/s, 1/(s Z))."""
     width, inv_s, scale = x1 - x0, m[_INV_S], m[_D_SCALE]
     if abs(width) * inv_s < _NARROW:
         _, d, y, _ = _logistic(m, 0.5 * (x0 + x1))
-        e = _exp(-abs(y) * inv_s)
+        e = fast_exp(-abs(y) * inv_s)
         tangent = (1.0 - e) / (1.0 + e)
         by_x = -0.5 * d * tangent * math.copysign(inv_s, y)
         return d, by_x, by_x, -d * tangent * abs(y), d / scale
@@ -148,7 +149,7 @@ def _mean_slopes(m, x0, x1):
     return mean, (mean - d0) * over, (d1 - mean) * over, by_inv_s, by_scale
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _refracted(m, h, cos_to):
     """(eta cos theta_t, sin gamma_t / h, cos gamma_t, length of a crossing)."""
     eta = m[_ETA]
@@ -158,14 +159,14 @@ def _refracted(m, h, cos_to):
     return eta_cos_tt, ratio, cos_gt, 2.0 * eta * cos_gt / eta_cos_tt
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _angles(low, ratio, phi):
     """phi - Phi of R, TT and TRT, up to whole turns."""
-    r, two_gt = phi + 2.0 * _asin(low), 2.0 * _asin(low * ratio)
+    r, two_gt = phi + 2.0 * fast_asin(low), 2.0 * fast_asin(low * ratio)
     return r, r - two_gt - math.pi, r - 2.0 * two_gt
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def wide_value(m, lobes, low, high, cos_to, phi):
     """Value of the BSDF times cosine per steradian, averaged over the h between ``low`` and ``high``: RGB.
 
@@ -194,16 +195,16 @@ def wide_value(m, lobes, low, high, cos_to, phi):
     return red, green, blue
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _inner(sigma, reflect, length, second, third, rest):
     """TT, TRT and the rest of one colour: their M D times their attenuations."""
-    transmit = _exp(-sigma * length)
+    transmit = fast_exp(-sigma * length)
     inside = reflect * transmit
     outer = (1.0 - reflect) * (1.0 - reflect) * transmit
     return outer * (second + inside * (third + rest * inside / max(1.0 - inside, 1e-12)))
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def wide_slopes(m, lobes, low, high, cos_to, phi, weights, row):
     """``wide_value`` and derivatives of a loss by its arguments.
 
@@ -281,10 +282,10 @@ def wide_slopes(m, lobes, low, high, cos_to, phi, weights, row):
     return (base + red, base + green, base + blue), by_lobes, (by_low, by_high, by_cos_to, by_0 + by_1)
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def _inner_slopes(sigma, weight, reflect, length, second, third, rest, sums, row, channel):
     """``_inner``, and ``sums`` with this colour's derivatives by F, the length and the three M D added."""
-    transmit = _exp(-sigma * length)
+    transmit = fast_exp(-sigma * length)
     inside = reflect * transmit
     outer = (1.0 - reflect) * (1.0 - reflect) * transmit
     over = 1.0 / max(1.0 - inside, 1e-12)

@@ -23,6 +23,7 @@ import math
 import numpy as np
 from numba import njit
 
+from usdfab.scattering.elementary_numba import fast_asin, fast_atan2, fast_exp, fast_log, fast_sincos
 from usdfab.scattering.fiber_numba import drawn_lobe, fiber_angles, fiber_direction, fiber_frame, prepare_fiber
 from usdfab.scattering.fiber_numba_tt import (
     attenuation_tt,
@@ -133,7 +134,7 @@ def density_in_window(lobe, scale, x):
     if lobe == 3:
         return 0.5 / d
     x = -abs(x)
-    e = math.exp(x / scale)
+    e = fast_exp(x / scale)
     mass = _below(min(x + d, math.pi) / scale) - _below(max(x - d, -math.pi) / scale)
     return e / ((1.0 + e) * (1.0 + e) * scale * mass)
 
@@ -149,7 +150,7 @@ def draw_in_window(lobe, scale, x, u):
     low, high = max(x - d, -math.pi), min(x + d, math.pi)
     a, b = _below(low / scale), _below(high / scale)
     q = min(max(a + u * (b - a), 1e-300), 1.0 - 1e-16)
-    return side * min(max(scale * math.log(q / (1.0 - q)), low), high)
+    return side * min(max(scale * fast_log(q / (1.0 - q)), low), high)
 
 
 @njit(**KERNEL)
@@ -166,8 +167,8 @@ def draw_aimed(lobe, scale, x, middle, width, u, choice):
         x1 = low + u * (high - low)
     else:
         q = min(max(a + u * (b - a), 1e-15), 1.0 - 1e-15)
-        x1 = min(max(middle + w * math.log(q / (1.0 - q)), low), high)
-    e = math.exp(-min(abs(x1 - middle) / w, 700.0))
+        x1 = min(max(middle + w * fast_log(q / (1.0 - q)), low), high)
+    e = fast_exp(-abs(x1 - middle) / w)
     return x1, _UNIFORM / (high - low) + (1.0 - _UNIFORM) * e / ((1.0 + e) * (1.0 + e) * w * (b - a))
 
 
@@ -200,9 +201,9 @@ def _offset_towards(h, psi, eta2, ratio):
     (turn of the ray around the fiber, rad, and of what it transmits less that of the light, per turn of the ray); the
     second is 0 where there is no such offset.
     """
-    start = math.asin(ratio * h)
+    start = fast_asin(ratio * h)
     for _ in range(4):
-        turn = math.asin(ratio * h) - start
+        turn = fast_asin(ratio * h) - start
         error = turn_tt(h, eta2) + turn - psi
         follow = ratio / math.sqrt(1.0 - ratio * ratio * h * h)
         slope = turn_tt_slope(h, eta2) + follow
@@ -220,7 +221,7 @@ def _azimuth_of_turn(flight, azimuth, e, f, turn):
     -------
     (step of the azimuth, rad, and turn per radian of it there); the second is 0 where no azimuth does it.
     """
-    c, s = math.cos(turn), math.sin(turn)
+    s, c = fast_sincos(turn)
     gx, gy, gz = c * f[0] - s * e[0], c * f[1] - s * e[1], c * f[2] - s * e[2]
     # The direction's part along g is a + b cos + c sin of the azimuth, and has to be 0.
     constant = flight[_SIN] * (flight[0] * gx + flight[1] * gy + flight[2] * gz)
@@ -229,7 +230,7 @@ def _azimuth_of_turn(flight, azimuth, e, f, turn):
     size = math.sqrt(cosine * cosine + sine * sine)
     if size <= abs(constant):
         return 0.0, 0.0
-    center, opening = math.atan2(sine, cosine) - azimuth, math.acos(-constant / size)
+    center, opening = fast_atan2(sine, cosine) - azimuth, 0.5 * math.pi + fast_asin(constant / size)
     one, two = _wrapped(center + opening), _wrapped(center - opening)
     step = one if abs(one) < abs(two) else two
     dx, dy, dz = fiber_direction(*flight[:11], azimuth + step)

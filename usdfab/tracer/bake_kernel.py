@@ -16,7 +16,7 @@ from numba import njit
 
 from usdfab.scattering.fiber_numba import fiber_direction, fiber_frame, load_fiber, prepare_fiber, sample_fiber_lobe
 from usdfab.tracer.counted import mix, next_uniform, start_stream
-from usdfab.tracer.intrinsics import KERNEL, NG, PRIM, U, borrow, new_ray_buffer
+from usdfab.tracer.intrinsics import ENTRY, KERNEL, NG, PRIM, U, borrow, new_ray_buffer
 from usdfab.tracer.slab import ESCAPED_UP, HIT, slab_occluded, trace_slab
 from usdfab.tracer.tangents import tangent_at
 from usdfab.tracer.world import HEIGHT, HIGH, LOW, MATERIAL, WIDTH, YARN, Patches
@@ -31,7 +31,7 @@ that is looked at and (3) on the other."""
 _ROULETTE_DEPTH = 5
 
 
-@njit(**KERNEL, nogil=True)
+@njit(**ENTRY, nogil=True)
 def bake_rows(
     addresses, patches, width, height, up, seed, rows, samples, paths, max_depth, last_warp, first_loose, sums
 ):

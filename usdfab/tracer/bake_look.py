@@ -23,7 +23,7 @@ from usdfab.fabric import FabricParameters
 from usdfab.scattering.surface_numba import eval_surface, pack_surface, prepare_surface
 from usdfab.tracer.bake import BakedMaps
 from usdfab.tracer.bake_filter import Map
-from usdfab.tracer.intrinsics import KERNEL
+from usdfab.tracer.intrinsics import ENTRY
 from usdfab.tracer.render import RenderSettings, Tracer
 from usdfab.usd.rig import rig_for, swatch_scene
 from usdfab.usd.scene import PointLight
@@ -67,7 +67,7 @@ class Look:
     error: NDArray[np.float64]
 
 
-@njit(**KERNEL)
+@njit(**ENTRY)
 def _mean_values(roughness, normals, weights, albedo, directions, shares, f0, packed):
     """Weighted means over texels of what comes back to +z: (3,) of diffuse light, and of the reflection.
 

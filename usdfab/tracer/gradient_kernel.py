@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from usdfab.tracer.intrinsics import KERNEL, borrow, new_ray_buffer
+from usdfab.tracer.intrinsics import ENTRY, borrow, new_ray_buffer
 from usdfab.tracer.kernel import trace_path
 from usdfab.tracer.tape import SHARED, Tape
 from usdfab.tracer.vertex import camera_sample, pixel_shift
 from usdfab.tracer.world import borrowed
 
 
-@njit(**KERNEL, nogil=True)
+@njit(**ENTRY, nogil=True)
 def gradient_tile(world, view, seed, window, samples, max_depth, slopes, owners, keep, film, sums):
     """Add samples and their derivatives to the pixels of ``window`` (x0, y0, x1, y1).
 

@@ -20,9 +20,14 @@ NG, U, V, PRIM, GEOM, INST = 12, 15, 16, 17, 18, 19
 ARGS_FILTER, ARGS_PLAIN = 24, 36
 WORDS = 48
 
-KERNEL: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "arcp"}}
-"""Options of kernels: divisions are not checked (what divides is guarded where it can be 0), and NaN and infinity keep
-their meaning."""
+KERNEL: dict[str, Any] = {
+    "cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz", "arcp"}, "_nrt": False
+}  # fmt: skip
+"""Options of what kernels call: divisions are not checked (what divides is guarded where it can be 0), NaN and infinity
+keep their meaning, and references to arrays are not counted: a scene has two dozen arrays, and counting them at each
+call takes 7 % of the tracer's time. So such a function can neither make an array nor return one that is not given."""
+ENTRY = {**KERNEL, "_nrt": True}
+"""Options of kernels that Python calls; they make arrays, and start threads."""
 _INVALID = np.uint32(0xFFFFFFFF)
 _INVOKE_ARGUMENT_FILTER = np.uint32(2)
 
@@ -53,16 +58,21 @@ def _as_pointer(typingctx, address):
     return signature, codegen
 
 
-@njit(cache=True, inline="always")
-def words_at(address):
-    """The memory at an address as uint32; who calls it knows how many there are."""
-    return carray(_as_pointer(address), 1 << 40, np.uint32)
+def _load(kind, returned):
+    def load(typingctx, address, index):
+        def codegen(context, builder, signature, args):
+            start = builder.inttoptr(args[0], kind.as_pointer())
+            return builder.load(builder.gep(start, [args[1]]))
+
+        return returned(types.uint64, types.int64), codegen
+
+    return intrinsic(load)
 
 
-@njit(cache=True, inline="always")
-def floats_at(address):
-    """The memory at an address as float32; who calls it knows how many there are."""
-    return carray(_as_pointer(address), 1 << 40, np.float32)
+word_at: Any = _load(ir.IntType(32), types.uint32)
+"""``word_at(address, k)``: the k-th uint32 of the memory at an address; who calls it knows how many there are."""
+float_at: Any = _load(ir.FloatType(), types.float32)
+"""The same of float32."""
 
 
 def _borrow(typingctx, array):

@@ -34,7 +34,7 @@ from usdfab.scattering.surface_numba import PREPARED_SURFACE, eval_surface, prep
 from usdfab.tracer.aimed import AZIMUTH, LEAST, NARROW, NO_FLIGHT, aim, aimed_light, fiber_at, flight_from, share_aimed
 from usdfab.tracer.counted import next_uniform
 from usdfab.tracer.film import ALBEDO, ALPHA, DEPTH, DIRECT, FIBER_ID, NORMAL, RAYS, SAMPLES, UV, YARN_ID
-from usdfab.tracer.intrinsics import KERNEL, PRIM, borrow, new_ray_buffer
+from usdfab.tracer.intrinsics import ENTRY, KERNEL, PRIM, borrow, new_ray_buffer
 from usdfab.tracer.lights import FAR, escaped_radiance, hit_light, light_blocks, sample_light
 from usdfab.tracer.slab import HIT, enter_slab, inverse_columns, leave_slab, to_patch, trace_slab
 from usdfab.tracer.surfaces import MAX_SURFACES, light_share, surface_frame, trace_macro, transmittance
@@ -359,7 +359,7 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
     return total_r, total_g, total_b
 
 
-@njit(**KERNEL, nogil=True)
+@njit(**ENTRY, nogil=True)
 def render_tile(world, view, seed, window, first_sample, samples, max_depth, film, squares):
     """Add samples to the pixels of ``window`` (x0, y0, x1, y1).
 

@@ -34,6 +34,7 @@ FIRST_DECISION = 16
 BLOCK = 8
 """Side in pixels of the blocks over which ``relative_error`` averages."""
 LARGE_PICTURE = 512 * 512
+SMALL_REGION = 128 * 128
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,8 @@ def plan_tiles(
     """
     side = tile_side(width, height)
     x0, y0, x1, y1 = region
+    if not adaptive and (x1 - x0) * (y1 - y0) < SMALL_REGION:
+        side = 8  # enough tiles for all threads; where each tile decides how good it is, tiles must not depend on it
 
     def window(row: int, column: int, crop: bool) -> Window:
         a, b = column * side, row * side

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from usdfab.tracer.intrinsics import KERNEL, floats_at, words_at
+from usdfab.tracer.intrinsics import KERNEL, float_at, word_at
 
 _SCALE = 32767.0
 
@@ -50,7 +50,7 @@ def _unpack(word):
 @njit(**KERNEL, forceinline=True)
 def radius_at(records, patch, prim):
     """Radius of the fiber that a segment belongs to, patch units."""
-    return np.float64(floats_at(records[patch, 2])[4 * np.int64(words_at(records[patch, 1])[2 * prim]) + 3])
+    return np.float64(float_at(records[patch, 2], 4 * np.int64(word_at(records[patch, 1], 2 * prim)) + 3))
 
 
 @njit(**KERNEL, forceinline=True)
@@ -64,9 +64,9 @@ def tangent_at(records, patch, prim, s):
     prim, s:
         Segment, and place along it. Range: [0, 1].
     """
-    tangents, segments = words_at(records[patch, 0]), words_at(records[patch, 1])
-    first, curve = np.int64(segments[2 * prim]), np.int64(segments[2 * prim + 1])
-    ax, ay, az = _unpack(np.int64(tangents[first]))
-    bx, by, bz = _unpack(np.int64(tangents[first + 1]))
+    tangents, segments = records[patch, 0], records[patch, 1]
+    first, curve = np.int64(word_at(segments, 2 * prim)), np.int64(word_at(segments, 2 * prim + 1))
+    ax, ay, az = _unpack(np.int64(word_at(tangents, first)))
+    bx, by, bz = _unpack(np.int64(word_at(tangents, first + 1)))
     r = 1.0 - s
     return curve, r * ax + s * bx, r * ay + s * by, r * az + s * bz

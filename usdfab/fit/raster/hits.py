@@ -25,7 +25,7 @@ from usdfab.fit.raster.segments import (
     pass_by_slopes,
 )
 from usdfab.fit.raster.visibility import Seen
-from usdfab.tracer.intrinsics import KERNEL, borrow
+from usdfab.tracer.intrinsics import ENTRY, KERNEL, borrow
 
 
 class Meeting(NamedTuple):
@@ -194,7 +194,7 @@ def _tangents_of(tangents, topology, segment):
     )  # fmt: skip
 
 
-@njit(**KERNEL, parallel=True)
+@njit(**ENTRY, parallel=True)
 def _meet(
     points_, radius_, tangents_, topology_, size_, start, direction, segment, copy, distance_, tangent_, h_
 ):  # fmt: skip
@@ -221,7 +221,7 @@ _CHUNK = 64 * BLOCK
 """Rays whose derivatives are kept before they are added to those by vertices."""
 
 
-@njit(**KERNEL, parallel=True)
+@njit(**ENTRY, parallel=True)
 def _meet_slopes(
     points_, radius_, tangents_, topology_, size_, start, direction, segment, copy, by_distance, by_tangent, by_h,
     by_points, by_tangents, by_radius,

@@ -32,7 +32,7 @@ from usdfab.fit.raster.segments import (
     settled,
 )
 from usdfab.fit.raster.visibility import NOTHING, Seen
-from usdfab.tracer.intrinsics import KERNEL, borrow
+from usdfab.tracer.intrinsics import ENTRY, KERNEL, borrow
 
 NONE, P_ENDS, Q_ENDS = 0, 1, 2
 """Between two pixels: no jump along this line of pixels; one where what p sees ends; or what q sees."""
@@ -142,7 +142,7 @@ def _showing(h, axis, unit, behind):
     return math.sqrt(h * h + sunk * sunk + _TINY) - 1.0
 
 
-@njit(**KERNEL, parallel=True)
+@njit(**ENTRY, parallel=True)
 def _classify(points_, radius_, topology_, size_, start_, direction_, segment_, copy_, p, q, r, along_row, kinds):
     count = len(p)
     for block in prange((count + BLOCK - 1) // BLOCK):
@@ -192,7 +192,7 @@ def _kind(points, radius, topology, size, start, direction, segment, copy, p, q,
     return (P_ENDS if a_ends else Q_ENDS) if keep else NONE
 
 
-@njit(**KERNEL, parallel=True)
+@njit(**ENTRY, parallel=True)
 def _cross(
     points_, radius_, topology_, size_, start_, direction_, segment, copy, p, q, kinds, beside, copies, t
 ):  # fmt: skip
@@ -225,7 +225,7 @@ _CHUNK = 32 * BLOCK
 """Pairs whose derivatives are kept before they are added to those by vertices."""
 
 
-@njit(**KERNEL, parallel=True)
+@njit(**ENTRY, parallel=True)
 def _cross_slopes(
     points_, radius_, topology_, size_, start_, direction_, p, q, beside, copies, by_t, by_points, by_radius
 ):  # fmt: skip

@@ -13,7 +13,7 @@ from numba import njit, prange
 
 from usdfab.fit.raster.segments import BLOCK, INLINE, SYSTEM
 from usdfab.scattering.fiber_numba_wide import WIDE_SIZE, wide_lobes, wide_lobes_slopes, wide_slopes, wide_value
-from usdfab.tracer.intrinsics import KERNEL, borrow
+from usdfab.tracer.intrinsics import ENTRY, KERNEL, borrow
 
 DIFFUSE_WEIGHT = 0.5
 """w_d of eq. 10: how much of the diffuse term follows the fiber's normal, the rest that of the cloth."""
@@ -101,7 +101,7 @@ def _move(sums, totals, block, row):
         sums[c] = 0.0
 
 
-@njit(**KERNEL, parallel=True)
+@njit(**ENTRY, parallel=True)
 def shade(
     distance, tangent, h_, lit, spread, material, topology_, color_, start, direction, segment, lamps_, intensity_,
     turn_, single, diffuse, unshadowed, colors,
@@ -158,7 +158,7 @@ def shade(
                 colors[k, 2] += intensity[lamp, 2] * blue / to_lamp[3]
 
 
-@njit(**KERNEL, parallel=True)
+@njit(**ENTRY, parallel=True)
 def shade_slopes(
     distance, tangent, h_, lit, spread, material, topology_, color_, start, direction, segment, lamps_, intensity_,
     turn_, single, diffuse, unshadowed, by_colors, by_distance, by_tangent, by_h, by_lit, by_spread, by_material,

@@ -28,7 +28,7 @@ from usdfab.fit.raster.segments import (
     settled,
 )
 from usdfab.fit.raster.visibility import Seen
-from usdfab.tracer.intrinsics import KERNEL, borrow
+from usdfab.tracer.intrinsics import ENTRY, borrow
 
 
 def shadow_edges(
@@ -129,7 +129,7 @@ def _cast(points, radius, topology, size, start, direction, distance, lamp, segm
     return pass_by(ends, radius[topology[segment, SYSTEM]], x, y, z)[0], segment, i, j
 
 
-@njit(**KERNEL, parallel=True)
+@njit(**ENTRY, parallel=True)
 def _classify(
     points_, radius_, topology_, size_, start_, direction_, distance_, segment_, copy_, caster, caster_copy, lamp_,
     p, q, r, along_row, sign,
@@ -161,7 +161,7 @@ def _classify(
                 sign[m] = 1 if beyond > 0.0 else -1
 
 
-@njit(**KERNEL, parallel=True)
+@njit(**ENTRY, parallel=True)
 def _cross(
     points_, radius_, topology_, size_, start_, direction_, distance_, caster, caster_copy, lamp_, p, q, sign, beside,
     copies, t,
@@ -186,7 +186,7 @@ _CHUNK = 32 * BLOCK
 """Pairs whose derivatives are kept before they are added to those by vertices."""
 
 
-@njit(**KERNEL, parallel=True)
+@njit(**ENTRY, parallel=True)
 def _cross_slopes(
     points_, radius_, topology_, size_, start_, direction_, distance_, lamp_, p, q, sign, beside, copies, by_t,
     by_points, by_radius, by_distance,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from usdfab.fit.raster.curves import CurveModel
 from usdfab.tracer import embree
 from usdfab.tracer.embree import EmbreeScene, curve_scene
-from usdfab.tracer.intrinsics import KERNEL, PRIM, filter_address, new_ray_buffer
+from usdfab.tracer.intrinsics import ENTRY, PRIM, filter_address, new_ray_buffer
 from usdfab.tracer.patch_scene import FIBER_RADIUS_UNITS
 from usdfab.tracer.slab import HIT, trace_slab
 from usdfab.tracer.world import EPSILON, HEIGHT, HIGH, LOW, PATCH_COLUMNS, UNITS, WIDTH
@@ -133,7 +133,7 @@ _SELF_HITS = 8
 """Segments of its own fiber that a shadow ray may pass."""
 
 
-@njit(**KERNEL, parallel=True)
+@njit(**ENTRY, parallel=True)
 def _look(trace, filter_function, handles, table, segments, copies, curves, eye, directions, lamps, segment, copy):
     count = len(directions)
     for block in prange((count + _ROW - 1) // _ROW):
