@@ -15,7 +15,7 @@ if mitsuba_variant.why_not():
 sys.path.append(str(Path(__file__).parents[1] / "tracer"))
 
 import mitsuba as mi
-from mitsuba_scene import curves_text, mitsuba_dict
+from mitsuba_scene import curves_text, mitsuba_dict, plugin_dict
 from scenes import fabric, swatch
 
 from usdfab.fibers import generate_patch
@@ -51,15 +51,7 @@ def both(cloth, depth: int, side: int, folder: Path):
     files = curves_text(patch, 1, center, folder)
     description = mitsuba_dict(mi, cloth, files, camera, list(scene.lights), (side, side), depth)
     for name in files:
-        yarn = cloth.system(name)
-        description[name]["bsdf"] = {
-            "type": "usdfab_fiber",
-            "albedo": {"type": "rgb", "value": list(yarn.albedo)},
-            "gamma_m": yarn.roughness_longitudinal,
-            "gamma_n": yarn.roughness_azimuthal,
-            "gamma_m0": yarn.roughness_primary,
-            "eta": yarn.ior,
-        }
+        description[name]["bsdf"] = plugin_dict(cloth.system(name))
     return mi.load_dict(description, parallel=False), scene, camera
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from usdfab.fabric import FabricParameters
+from usdfab.fabric import FabricParameters, YarnParameters
 from usdfab.fibers import Patch
 from usdfab.scattering.roughness import absorption_from_albedo
 from usdfab.usd.scene import Camera, DomeLight, PointLight
@@ -106,6 +106,18 @@ def mitsuba_dict(
             },
         }
     return scene
+
+
+def plugin_dict(yarn: YarnParameters) -> dict:
+    """Our own BSDF in Mitsuba for the fibers of a yarn, where Mitsuba's `hair` is not exact enough."""
+    return {
+        "type": "usdfab_fiber",
+        "albedo": {"type": "rgb", "value": list(yarn.albedo)},
+        "gamma_m": yarn.roughness_longitudinal,
+        "gamma_n": yarn.roughness_azimuthal,
+        "gamma_m0": yarn.roughness_primary,
+        "eta": yarn.ior,
+    }
 
 
 def _scaled(to_world: np.ndarray) -> np.ndarray:
