@@ -93,7 +93,7 @@ def pretended(monkeypatch: pytest.MonkeyPatch, small: None) -> Iterator[dict[str
     monkeypatch.setattr(pipeline, "analyze_photo", analysed)
     monkeypatch.setattr(pipeline, "brightness_curves", lambda *_, **__: {})
     monkeypatch.setattr(pipeline, "photo_exposure", lambda *_: 1.0)
-    monkeypatch.setattr(pipeline, "with_inverted_albedo", lambda shown, *_, **__: (shown, ("dyed",)))
+    monkeypatch.setattr(pipeline, "with_inverted_albedo_and_light", lambda shown, *_, **__: (shown, 1.0, ("dyed",)))
     monkeypatch.setattr(later_stages, "run_raster", raster)
     monkeypatch.setattr(path_run, "run_path", path)
     yield ran

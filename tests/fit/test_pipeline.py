@@ -21,6 +21,7 @@ from usdfab.fit.albedo import (
     photo_exposure,
     visible_means,
     with_inverted_albedo,
+    with_inverted_albedo_and_light,
 )
 from usdfab.fit.analysis import PhotoAnalysis, YarnSystem
 from usdfab.fit.pipeline import DEFAULT_WIDTH, fit_photo
@@ -129,6 +130,29 @@ def test_albedo_is_found_again_from_the_colors_that_it_shows() -> None:
     assert not notes
     assert np.abs(np.subtract(found.warp.albedo, CLOTH.warp.albedo)).max() < 0.15
     assert np.abs(np.subtract(found.weft.albedo, CLOTH.weft.albedo)).max() < 0.15
+
+
+def test_bright_yarns_among_dark_ones_keep_their_hue() -> None:
+    """Dark neighbours swallow light that the curves of evenly dyed cloth count on; a camera that exposes more, too."""
+    cloth = replace(
+        CLOTH,
+        warp=replace(CLOTH.warp, albedo=(0.93, 0.85, 0.7)),
+        weft=replace(CLOTH.weft, albedo=(0.02, 0.02, 0.02)),
+    )
+    seen = {system: 2.0 * mean for system, mean in visible_means(cloth, seed=5).items()}
+    shown = replace(
+        cloth,
+        warp=replace(cloth.warp, albedo=tuple(np.clip(seen["warp"], 0, 1))),
+        weft=replace(cloth.weft, albedo=tuple(np.clip(seen["weft"], 0, 1))),
+    )
+    curves = brightness_curves(shown)
+    exposure = photo_exposure(shown, curves)
+    found, light, _ = with_inverted_albedo_and_light(dimmed(shown, exposure), curves)
+    assert light > 1.1
+    red, green, blue = found.warp.albedo
+    assert 0.99 > red > green > blue
+    again = {system: exposure * light * mean for system, mean in visible_means(found, seed=9).items()}
+    np.testing.assert_allclose(again["warp"], shown.warp.albedo, rtol=0.1)
 
 
 def test_too_bright_a_photo_is_said() -> None:

@@ -156,14 +156,44 @@ def with_inverted_albedo(
     The curves dye both systems alike, but light that crosses from one to the other carries the other's colour. So the
     result is rendered ``REFINEMENTS`` times, and what it shows too much or too little of goes into the next reading.
     """
+    found, _, notes = _inverted(fabric, curves, paths, seed, progress, rig, free_light=False)
+    return found, notes
+
+
+def with_inverted_albedo_and_light(
+    fabric: FabricParameters,
+    curves: dict[System, BrightnessCurve],
+    paths: int = PATHS,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    rig: Rig | None = None,
+) -> tuple[FabricParameters, float, tuple[str, ...]]:
+    """``with_inverted_albedo`` where the light is not known: (fabric, light, notes).
+
+    Bright yarns among dark ones must be brighter than the curves say, since the dark ones take part of their light. If
+    more than fibers of ``BRIGHT_ALBEDO`` is asked for, the light was stronger; else their colour would be lost, all
+    channels being at the limit. ``light`` (1 or more) is how many times brighter the fabric has to be shown.
+    """
+    return _inverted(fabric, curves, paths, seed, progress, rig, free_light=True)
+
+
+def _inverted(
+    fabric: FabricParameters, curves: dict[System, BrightnessCurve], paths: int, seed: int,
+    progress: Callable[[int, int], None] | None, rig: Rig | None, free_light: bool,
+) -> tuple[FabricParameters, float, tuple[str, ...]]:  # fmt: skip
     wanted = {s: np.mean(fabric.system(s).colors(), axis=0) for s in SYSTEMS}
     factors = {s: np.ones(3) for s in SYSTEMS}
+    light = 1.0
     found = _read_backwards(fabric, curves, factors)
     for step in range(REFINEMENTS):
         shown = visible_means(found, paths, seed + 1 + step, rig)
         for system in SYSTEMS:
-            ratio = wanted[system] / np.maximum(shown[system], 1e-6)
+            ratio = wanted[system] / np.maximum(light * shown[system], 1e-6)
             factors[system] = factors[system] * np.clip(ratio, 0.5, 2.0) ** OVER_RELAXATION
+        if free_light:
+            more = max(1.0, *(_asked_of_bright(fabric, s, curves[s], factors[s]) for s in SYSTEMS))
+            light *= more
+            factors = {s: f / more for s, f in factors.items()}
         found = _read_backwards(fabric, curves, factors)
         if progress:
             progress(step + 1, REFINEMENTS)
@@ -172,7 +202,15 @@ def with_inverted_albedo(
         for system in SYSTEMS
         if max(max(c) for c in fabric.system(system).colors()) > curves[system].brightness[-1]
     )
-    return found, notes
+    return found, light, notes
+
+
+def _asked_of_bright(
+    fabric: FabricParameters, system: System, curve: BrightnessCurve, factors: NDArray[np.float64]
+) -> float:
+    """What a system's brightest channel asks for, over what fibers of ``BRIGHT_ALBEDO`` give."""
+    bright = float(np.interp(BRIGHT_ALBEDO, curve.albedo, curve.brightness))
+    return float((np.asarray(fabric.system(system).colors()) * factors).max()) / max(bright, 1e-6)
 
 
 def _read_backwards(

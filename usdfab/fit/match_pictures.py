@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 from usdfab.fabric import FabricParameters
 from usdfab.imaging import denoise
 from usdfab.imaging.lens import photographed
-from usdfab.tracer import RenderSettings, Tracer
+from usdfab.tracer import Render, RenderSettings, Tracer
 from usdfab.usd.rig import Rig, sample_scene
 
 if TYPE_CHECKING:
     from usdfab.fit.texture import Target
 
 Singles = NDArray[np.float32]
+
+MOST_SPP = 32
 
 VARIED_CELLS = 16
 """Crossings of all variants of the repeat together beyond which pictures show fewer variants."""
@@ -33,10 +35,13 @@ class MatchPictures:
         Statistics of the photo.
     width, spp, seed:
         Pixels along x, samples per pixel before the denoiser, and seed of the renders.
+    later_scale:
+        Least scale of azimuthal lobes after the first bounce, rad, see ``Tracer``; None: as they are.
     """
 
-    def __init__(self, target: Target, width: int, spp: int, seed: int) -> None:
+    def __init__(self, target: Target, width: int, spp: int, seed: int, later_scale: float | None = None) -> None:
         self.target, self.width, self.spp, self.seed = target, width, spp, seed
+        self.later_scale = later_scale
         weights = []
         for statistic, upper in zip(target.statistics, self._upper(target.statistics), strict=True):
             # Symmetric matrices: each pair off the diagonal stands for two entries.
@@ -52,15 +57,28 @@ class MatchPictures:
     def _upper(statistics: tuple) -> list[tuple[NDArray, NDArray]]:
         return [np.triu_indices(s.shape[-1]) if s.ndim == 3 else (np.arange(s.shape[-1]),) * 2 for s in statistics]
 
+    def spend(self, rays: float, fabric: FabricParameters, rig: Rig | None) -> None:
+        """Raise ``spp`` to what so many rays a pixel pay for: paths end soon in dark cloth.
+
+        Deterministic: the rays of a small picture of the fabric are counted.
+        """
+        probe = self._render(fabric, rig, max(16, self.width // 6), 2)
+        each = probe.rays / max(float(probe.samples.sum()), 1.0)
+        self.spp = int(np.clip(rays / max(each, 1.0), self.spp, MOST_SPP))
+
     def picture(self, fabric: FabricParameters, rig: Rig | None) -> Singles:
         """(H, W, 3) linear, denoised, at exposure 1."""
+        render = self._render(fabric, rig, self.width, self.spp)
+        return denoise(render.pixels, render.albedo, render.normal)
+
+    def _render(self, fabric: FabricParameters, rig: Rig | None, width: int, spp: int) -> Render:
         repeat = math.prod(fabric.repeat())
         # Statistics need only so many different crossings; each is fibers to build and to keep.
         fewer = replace(fabric, variants=max(1, min(fabric.variants, VARIED_CELLS // repeat)))
         scene = sample_scene(fewer, rig)
-        size = (self.width, max(1, round(self.width * fabric.size[1] / fabric.size[0])))
-        render = Tracer(scene).render(scene.cameras[0], RenderSettings(size, spp=self.spp, seed=self.seed))
-        return denoise(render.pixels, render.albedo, render.normal)
+        size = (width, max(1, round(width * fabric.size[1] / fabric.size[0])))
+        tracer = Tracer(scene, later_scale=self.later_scale)
+        return tracer.render(scene.cameras[0], RenderSettings(size, spp=spp, seed=self.seed))
 
     def residuals(self, picture: Singles, exposure: float, blur: float = 0.0) -> Singles:
         """What differs at an exposure, through a camera whose blur is given in pixels (``imaging.lens``).

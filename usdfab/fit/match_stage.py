@@ -57,7 +57,13 @@ class MatchSettings:
     width:
         Pixels along x of the pictures that are compared.
     spp:
-        Samples per pixel of each picture, before the denoiser.
+        Samples per pixel of each picture, before the denoiser; at least.
+    rays:
+        Rays a pixel that a picture may cost; where they pay for more samples than ``spp``, there are more.
+    later_scale:
+        Least scale of fibers' azimuthal lobes after the first bounce, rad, in these pictures (``Tracer``). At .15 the
+        variance is less than half, the mean brightness 1 % off at most, and denoised pictures of 4 samples are a
+        quarter nearer to those of 200, in their texture.
     iterations:
         Rounds of finite differences.
     steps:
@@ -74,6 +80,8 @@ class MatchSettings:
 
     width: int = 240
     spp: int = 4
+    rays: int = 0
+    later_scale: float | None = None
     iterations: int = 2
     steps: int = 3
     levels: tuple[int, ...] = (1, 2, 4)
@@ -103,10 +111,13 @@ DRAFTED = (
 )  # fmt: skip
 """What a draft moves: what one round can settle, and is seen at its resolution."""
 
+SOFTER = 0.15
+"""``later_scale`` of all qualities."""
+
 QUALITIES: dict[str, MatchSettings] = {
-    "draft": MatchSettings(width=192, spp=4, iterations=1, free=DRAFTED),
-    "standard": MatchSettings(),
-    "paper": MatchSettings(width=360, spp=16, iterations=4, levels=(1, 2, 4)),
+    "draft": MatchSettings(width=192, spp=4, rays=100, later_scale=SOFTER, iterations=1, free=DRAFTED),
+    "standard": MatchSettings(rays=200, later_scale=SOFTER),
+    "paper": MatchSettings(width=360, spp=16, rays=500, later_scale=SOFTER, iterations=4, levels=(1, 2, 4)),
 }
 """What ``--quality`` means here."""
 
@@ -202,9 +213,10 @@ def match_photo(
     from usdfab.fit.texture import Target
 
     picture = torch.from_numpy(np.ascontiguousarray(goal, dtype=np.float32)).permute(2, 0, 1)
-    pictures = MatchPictures(
-        Target.from_image(picture, net, settings.levels, settings.kind), settings.width, settings.spp, settings.seed
-    )
+    target = Target.from_image(picture, net, settings.levels, settings.kind)
+    pictures = MatchPictures(target, settings.width, settings.spp, settings.seed, settings.later_scale)
+    if settings.rays:
+        pictures.spend(settings.rays, start, rig)
     identity = fingerprint(start, np.asarray(goal, dtype=np.float32), settings, float(exposure), rig, rig_known)
     state = None
     if checkpoint is not None and checkpoint.exists():

@@ -19,7 +19,7 @@ from usdfab.fit.albedo import (
     brightness_curves,
     dimmed,
     photo_exposure,
-    with_inverted_albedo,
+    with_inverted_albedo_and_light,
 )
 from usdfab.fit.analysis import PhotoAnalysis, analyze_photo
 from usdfab.fit.course import Course, Progress
@@ -180,16 +180,16 @@ def _analysed(
         shown, albedo_paths, seed=seed, rig=rig, progress=lambda done, _: say("measuring albedo", 2 + done, steps)
     )
     exposure = photo_exposure(shown, curves)
-    shown = dimmed(shown, exposure)
-    kept.photo = analysis, shown, prior_notes
-    fabric, notes = with_inverted_albedo(
-        shown,
+    fabric, light, notes = with_inverted_albedo_and_light(
+        dimmed(shown, exposure),
         curves,
         albedo_paths,
         seed=seed,
         rig=rig,
         progress=lambda done, _: say("measuring albedo", 2 + ladder + done, steps),
     )
+    exposure *= light
+    kept.photo = analysis, dimmed(shown, exposure), prior_notes
     return StageOutcome("analysis", fabric, time.perf_counter() - begun, notes=tuple(notes), exposure=exposure, rig=rig)
 
 

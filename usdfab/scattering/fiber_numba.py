@@ -67,6 +67,7 @@ __all__ = [
     "prepare_fiber",
     "sample_fiber",
     "sample_fiber_lobe",
+    "soften_fiber",
 ]
 
 ETA_TEXTILE = 1.55
@@ -170,8 +171,17 @@ def pack_fiber(
     p[_SIN_TILT : _SIN_TILT + 3] = np.sin(tilts)
     p[_COS_TILT : _COS_TILT + 3] = np.cos(tilts)
 
-    # Trimmed logistic: CDF(x) = 1 / (1 + e^(-x/s)), so CDF(pi) - CDF(-pi) = tanh(pi / 2s).
-    s = float(azimuthal_scale(gamma_n))
+    _set_azimuthal(p, float(azimuthal_scale(gamma_n)))
+
+    v = lobe_variances(gamma_m, gamma_m0)[:3]
+    p[_V : _V + 3] = v
+    p[_INV_V : _INV_V + 3] = 1.0 / v
+    p[_M_SCALE : _M_SCALE + 3] = -1.0 / (v * np.expm1(-2.0 / v))
+    return p
+
+
+def _set_azimuthal(p: npt.NDArray[np.float64], s: float) -> None:
+    """Trimmed logistic: CDF(x) = 1 / (1 + e^(-x/s)), so CDF(pi) - CDF(-pi) = tanh(pi / 2s)."""
     inside = math.tanh(_PI / (2.0 * s))
     p[_S] = s
     p[_INV_S] = 1.0 / s
@@ -179,11 +189,12 @@ def pack_fiber(
     p[_D_BELOW] = math.exp(-_PI / s) / (1.0 + math.exp(-_PI / s))
     p[_D_INSIDE] = inside
 
-    v = lobe_variances(gamma_m, gamma_m0)[:3]
-    p[_V : _V + 3] = v
-    p[_INV_V : _INV_V + 3] = 1.0 / v
-    p[_M_SCALE : _M_SCALE + 3] = -1.0 / (v * np.expm1(-2.0 / v))
-    return p
+
+def soften_fiber(p: npt.NDArray[np.float64], scale: float) -> npt.NDArray[np.float64]:
+    """The material (FIBER_SIZE,) with an azimuthal logistic of at least this scale, rad; it absorbs as before."""
+    softer = p.copy()
+    _set_azimuthal(softer, max(scale, float(p[_S])))
+    return softer
 
 
 # --- The pieces that evaluation, sampling and density share ---

@@ -188,7 +188,7 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
             curve, ax, ay, az, nx, ny, nz = fiber_at(patches, buffer, patch, m, inverse)
             owner = patches.curves[int(patches.table[patch, FIRST_CURVE]) + curve]
             row = np.int64(owner[MATERIAL])
-            fiber_material = load_fiber(patches.materials, row)
+            fiber_material = load_fiber(patches.materials, row if first else row + patches.later)
             if tinted:
                 fiber_material = tint_fiber(fiber_material, patches.albedo, row, tint_r, tint_g, tint_b)
             sin_to, cos_to, h, ex, ey, ez, fx, fy, fz = fiber_frame(ax, ay, az, nx, ny, nz, -dx, -dy, -dz)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
-from usdfab.scattering.fiber_numba import FIBER_SIZE
+from usdfab.scattering.fiber_numba import FIBER_SIZE, soften_fiber
 from usdfab.tracer import embree
 from usdfab.tracer.accumulate import Progress, Sums, ThreadRunner, accumulate
 from usdfab.tracer.film import (
@@ -117,7 +117,13 @@ class Render:
 class Tracer:
     """A scene made ready for the kernels. Make it once, render it as often as you like."""
 
-    def __init__(self, scene: Scene, textures: Mapping[str, NDArray] | None = None, strict: bool = False) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        textures: Mapping[str, NDArray] | None = None,
+        strict: bool = False,
+        later_scale: float | None = None,
+    ) -> None:
         """Build tiles, meshes, materials and lights.
 
         Parameters
@@ -126,6 +132,9 @@ class Tracer:
             Images of dome lights by path, linear (H, W, 3). Textures of materials are read here.
         strict:
             Whether a texture that cannot be read is an error; else it is one of ``warnings``.
+        later_scale:
+            Least scale, rad, of the azimuthal lobes of fibers at all bounces but the first (``soften_fiber``): a
+            fraction of the noise, and what light does deep in the cloth is a little blurred. None: as they are.
         """
         glow = any(np.any(m.emissive) or "emissiveColor" in m.textures for m in scene.materials if m.fabric < 0)
         if not scene.lights and not glow:
@@ -164,7 +173,7 @@ class Tracer:
         addresses = tuple(np.uint64(a) for a in (intersect, occluded, filter_address(), self._macro_scene.handle))
         self.world = World(
             macro,
-            pack_patches(self._tiles),
+            pack_patches(self._tiles, later_scale),
             materials,
             pack_textures(used, images),
             pack_lights(scene, dict(textures or {})),
@@ -275,7 +284,7 @@ def pack_view(camera: Camera, width: int, height: int, moves: bool) -> View:
     )
 
 
-def pack_patches(scenes: list[PatchScene]) -> Patches:
+def pack_patches(scenes: list[PatchScene], later_scale: float | None = None) -> Patches:
     """Tiles as kernels read them; they hold addresses in the scenes, which the caller keeps."""
     rows, materials, count = [], 0, 0
     curves = []
@@ -285,6 +294,11 @@ def pack_patches(scenes: list[PatchScene]) -> Patches:
         curves[-1][:, MATERIAL] += materials
         materials += len(scene.materials)
         count += len(scene.curves)
+    packed = np.concatenate([s.materials for s in scenes] or [np.zeros((1, FIBER_SIZE))])
+    later = 0
+    if later_scale is not None and scenes:
+        later = len(packed)
+        packed = np.concatenate([packed, [soften_fiber(row, later_scale) for row in packed]])
     return Patches(
         table=np.array(rows, dtype=float).reshape(-1, PATCH_COLUMNS),
         handles=np.array([s.scene.handle for s in scenes], dtype=np.uint64),
@@ -292,9 +306,10 @@ def pack_patches(scenes: list[PatchScene]) -> Patches:
             [[a.ctypes.data for a in (s.tangents, s.segments, s.vertices)] for s in scenes], dtype=np.uint64
         ).reshape(-1, 3),
         # Without fabrics one row of each: kernels read it before they know whether they need it.
-        materials=np.concatenate([s.materials for s in scenes] or [np.zeros((1, FIBER_SIZE))]),
+        materials=packed,
         albedo=np.concatenate([s.albedo for s in scenes] or [np.zeros((1, 4))]),
         curves=np.concatenate(curves or [np.zeros((1, 2), dtype=np.int32)]),
+        later=later,
     )
 
 

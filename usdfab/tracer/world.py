@@ -42,6 +42,8 @@ class Patches(NamedTuple):
         Fiber albedo coefficient C (3) and 1 / q(gamma_N), with which C becomes absorption.
     curves: (C, 2) int32
         1 + yarn, warp first, and row of ``materials`` of each curve; all patches, one after the other.
+    later: int
+        From a row of ``materials`` to the one that later bounces see; 0: the same.
     """
 
     table: NDArray[np.float64]
@@ -50,6 +52,7 @@ class Patches(NamedTuple):
     materials: NDArray[np.float64]
     albedo: NDArray[np.float64]
     curves: NDArray[np.int32]
+    later: int = 0
 
 
 class Macro(NamedTuple):
@@ -140,8 +143,9 @@ def borrowed(world):
         borrow(m.mesh), borrow(m.fabrics), borrow(m.placements), borrow(m.first), borrow(m.bounds), m.meshes,
     )  # fmt: skip
     patches = Patches(
-        borrow(p.table), borrow(p.handles), borrow(p.records), borrow(p.materials), borrow(p.albedo), borrow(p.curves)
-    )
+        borrow(p.table), borrow(p.handles), borrow(p.records), borrow(p.materials), borrow(p.albedo), borrow(p.curves),
+        p.later,
+    )  # fmt: skip
     return World(
         macro,
         patches,
