@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, strategies as st
 from small_network import small_net
 
@@ -14,11 +15,13 @@ from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, YarnParameters, weave_from_name
 from usdfab.fit import features, match_space, match_stage
 from usdfab.fit.features import FeatureNet
+from usdfab.fit.match_pictures import MOST_SPP, MatchPictures
 from usdfab.fit.match_run import run_match
 from usdfab.fit.match_space import BLUR, BLUR_UNIT, EXPOSURE, MOVES, MatchSpace, Move
 from usdfab.fit.match_stage import MatchResult, MatchSettings, checked_match_quality, match_photo
 from usdfab.fit.match_steps import SOFT, broyden_update, damped_step, normal_equations, soft_l1
 from usdfab.fit.raster_stage import StageSettings
+from usdfab.fit.texture import Target
 from usdfab.imaging import denoise
 from usdfab.imaging.lens import through_lens
 from usdfab.tracer import RenderSettings, Tracer
@@ -232,7 +235,7 @@ def test_the_cameras_blur_is_found(
 ) -> None:
     """Colours, exposure and sharpness from a photo that is blurred or sharpened, whose scale says how far in metres."""
     monkeypatch.setattr(match_space, "BLUR_UNIT", 1.0 / SMALL.width)
-    settings = replace(SMALL, free=("albedo", BLUR, EXPOSURE), iterations=3)
+    settings = replace(SMALL, free=("albedo", BLUR, EXPOSURE), iterations=4)
     photo = np.maximum(through_lens(goal, pixels), 0.0)
     result = match_photo(CLOTH, photo, settings, net=net, exposure=1.2)
     assert result.rig is not None
@@ -261,3 +264,21 @@ def test_blur_moves_through_sharp_and_stops() -> None:
     beyond = MatchSpace.about(CLOTH, (BLUR,), blur=3 * unit)
     assert beyond.blur_at(np.zeros(1)) == 3 * unit
     assert beyond.blur_at(np.array([-20.0])) == pytest.approx(2 * unit)
+
+
+# --- what pictures cost ---
+
+
+def test_dark_cloth_gets_more_samples_for_the_same_rays(net: FeatureNet, goal: np.ndarray) -> None:
+    picture = torch.from_numpy(goal.astype(np.float32)).permute(2, 0, 1)
+    pictures = MatchPictures(Target.from_image(picture, net, (1,), "gram"), 32, 2, 0)
+    found = []
+    for albedo in ((0.95,) * 3, (0.05,) * 3):
+        pictures.spp = 2
+        dyed = replace(CLOTH, warp=replace(YARN, albedo=albedo), weft=replace(YARN, albedo=albedo))
+        pictures.spend(120.0, dyed, None)
+        found.append(pictures.spp)
+    bright, dark = found
+    assert 2 < bright < dark <= MOST_SPP
+    pictures.spend(1.0, CLOTH, None)
+    assert pictures.spp == dark
