@@ -79,7 +79,7 @@ def fast_asin(x):
 def fast_atan2(y, x):
     """Angle of (x, y) in [-pi, pi]: absolute error 2e-10; 0 or pi for (0, 0), as the signs say."""
     a, b = abs(x), abs(y)
-    q = min(a, b) / max(max(a, b), 1e-300)
+    q = min(a, b) / max(a, b, 5e-324)
     t = q * q
     p = -0.006394791584938274 + t * 0.0009375633484261502
     p = -0.042088151817438024 + t * (0.020467880307898128 + t * p)
