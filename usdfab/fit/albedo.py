@@ -156,7 +156,7 @@ def with_inverted_albedo(
     The curves dye both systems alike, but light that crosses from one to the other carries the other's colour. So the
     result is rendered ``REFINEMENTS`` times, and what it shows too much or too little of goes into the next reading.
     """
-    found, _, notes = _inverted(fabric, curves, paths, seed, progress, rig, free_light=False)
+    found, _, notes = with_inverted_albedo_and_light(fabric, curves, paths, seed, progress, rig, most_light=1.0)
     return found, notes
 
 
@@ -167,20 +167,14 @@ def with_inverted_albedo_and_light(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
     rig: Rig | None = None,
+    most_light: float = math.inf,
 ) -> tuple[FabricParameters, float, tuple[str, ...]]:
     """``with_inverted_albedo`` where the light is not known: (fabric, light, notes).
 
     Bright yarns among dark ones must be brighter than the curves say, since the dark ones take part of their light. If
     more than fibers of ``BRIGHT_ALBEDO`` is asked for, the light was stronger; else their colour would be lost, all
-    channels being at the limit. ``light`` (1 or more) is how many times brighter the fabric has to be shown.
+    channels being at the limit. ``light`` (1 to ``most_light``) is how many times brighter the fabric has to be shown.
     """
-    return _inverted(fabric, curves, paths, seed, progress, rig, free_light=True)
-
-
-def _inverted(
-    fabric: FabricParameters, curves: dict[System, BrightnessCurve], paths: int, seed: int,
-    progress: Callable[[int, int], None] | None, rig: Rig | None, free_light: bool,
-) -> tuple[FabricParameters, float, tuple[str, ...]]:  # fmt: skip
     wanted = {s: np.mean(fabric.system(s).colors(), axis=0) for s in SYSTEMS}
     factors = {s: np.ones(3) for s in SYSTEMS}
     light = 1.0
@@ -190,10 +184,10 @@ def _inverted(
         for system in SYSTEMS:
             ratio = wanted[system] / np.maximum(light * shown[system], 1e-6)
             factors[system] = factors[system] * np.clip(ratio, 0.5, 2.0) ** OVER_RELAXATION
-        if free_light:
-            more = max(1.0, *(_asked_of_bright(fabric, s, curves[s], factors[s]) for s in SYSTEMS))
-            light *= more
-            factors = {s: f / more for s, f in factors.items()}
+        more = max(1.0, *(_asked_of_bright(fabric, s, curves[s], factors[s]) for s in SYSTEMS))
+        more = min(more, most_light / light)
+        light *= more
+        factors = {s: f / more for s, f in factors.items()}
         found = _read_backwards(fabric, curves, factors)
         if progress:
             progress(step + 1, REFINEMENTS)

@@ -139,7 +139,7 @@ class LaterStages:
             elif name == "network":
                 work = NETWORK_SECONDS
             elif name == "match" and self.match is not None:
-                work = SECONDS_PER_MATCH_SAMPLE * self.match.pictures * self.match.width**2 * self.match.spp
+                work = SECONDS_PER_MATCH_SAMPLE * self.match.pictures * self.match.width**2 * self.match.samples
             elif self.path is not None:
                 work = SECONDS_PER_MILLION_PATHS * self.path.paths + SECONDS_PER_STEP * self.path.iterations
             result[name] = work + JUDGING_SECONDS

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Singles = NDArray[np.float32]
 
 MOST_SPP = 32
+"""Samples per pixel beyond which ``spend`` buys no more."""
 
 VARIED_CELLS = 16
 """Crossings of all variants of the repeat together beyond which pictures show fewer variants."""
@@ -64,7 +65,7 @@ class MatchPictures:
         """
         probe = self._render(fabric, rig, max(16, self.width // 6), 2)
         each = probe.rays / max(float(probe.samples.sum()), 1.0)
-        self.spp = int(np.clip(rays / max(each, 1.0), self.spp, MOST_SPP))
+        self.spp = max(self.spp, min(int(rays / max(each, 1.0)), MOST_SPP))
 
     def picture(self, fabric: FabricParameters, rig: Rig | None) -> Singles:
         """(H, W, 3) linear, denoised, at exposure 1."""

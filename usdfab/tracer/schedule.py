@@ -35,6 +35,7 @@ BLOCK = 8
 """Side in pixels of the blocks over which ``relative_error`` averages."""
 LARGE_PICTURE = 512 * 512
 SMALL_REGION = 128 * 128
+"""Pixels below which a region has small tiles, where no tile decides for itself."""
 
 
 @dataclass(frozen=True)
