@@ -213,7 +213,7 @@ def test_passes_do_not_show(sample):
     assert len(seen) > 2 and seen[-1][0] == seen[-1][1] and seen == sorted(seen)
     view = pack_view(camera, 16, 16, False)
     film, squares = np.zeros((16, 16, CHANNELS)), np.zeros((16, 16, 3))
-    render_tile(tracer.world, view, np.uint64(3), (0, 0, 16, 16), 0, 11, 64, film, squares)
+    render_tile(tracer.world, view, np.uint64(3), (0, 0, 16, 16), 0, 11, 64, film, squares, None)
     np.testing.assert_array_equal(render.pixels, (film[..., :3] / 11).astype(np.float32))
 
 

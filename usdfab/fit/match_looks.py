@@ -2,8 +2,7 @@
 
 Derivatives lead from a fabric to its neighbours. That the lamp stood aside, that yarns are round and touch where dark
 valleys look like gaps, that they are spun hard the other way or plied, is no neighbour: the way there leads uphill. So
-these are simply looked at, one question after the other, each with the answers to those before, and what comes closer
-to the photo is kept.
+these are simply looked at, each with the answers to others, and what comes closest to the photo is kept.
 
 Round, closed, bulging yarns under a lamp across them are what dark satin needs most: flat ones under a lamp near the
 camera have no shading, and only gaps could make the dark lines of the photo.
@@ -14,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Any
 
 from usdfab.fabric import SYSTEMS, FabricParameters, YarnParameters
@@ -57,6 +57,18 @@ CLOSED_COVER = 1.04
 
 MOST_TWIST = 0.6
 
+SHAPES = 2
+"""Shapes of yarns that the first question asks for, each under the same lamps: open and closed cloth."""
+
+NEARLY = 1.15
+"""Loss, over that of the best shape of yarns, up to which another is followed, too."""
+
+SLACK = 0.05
+"""Of the loss: how much more a look may gain than the last time without being overlooked."""
+
+LOOKS_AGAIN = 0.5
+"""How many looks are taken again, about, over the number of looks."""
+
 
 @dataclass(frozen=True)
 class Seen:
@@ -67,6 +79,8 @@ class Seen:
 
 
 Look = Callable[[Seen], Seen]
+Answers = tuple[tuple[int, int], ...]
+"""Numbers of questions and of the looks that answer them, in the order in which they were found."""
 
 
 def questions(shapes: bool, rig_known: bool) -> tuple[tuple[Look, ...], ...]:
@@ -99,12 +113,72 @@ def questions(shapes: bool, rig_known: bool) -> tuple[tuple[Look, ...], ...]:
     )
 
 
-def looks_at(start: Seen, asked: tuple[tuple[Look, ...], ...], answers: tuple[int, ...]) -> Seen:
-    """``start`` with the first ``answers`` (numbers of looks, -1 for none) to the questions."""
-    for question, answer in zip(asked, answers, strict=False):
-        if answer >= 0:
-            start = question[answer](start)
+def looks_at(start: Seen, asked: tuple[tuple[Look, ...], ...], answers: Answers) -> Seen:
+    """``start`` with the looks that ``answers`` name, in their order."""
+    for question, look in answers:
+        start = asked[question][look](start)
     return start
+
+
+def best_answers(asked: tuple[tuple[Look, ...], ...], loss_of: Callable[[Answers], float]) -> Answers:
+    """The answers of least loss that a greedy search finds.
+
+    The first question is asked before all others, since whether cloth is open or closed, and where the lamp stands,
+    decides which of the others help; then, whichever helps most comes next. Where another shape of yarn, or none of
+    these, came nearly as close, the search goes on from there, too.
+
+    Parameters
+    ----------
+    asked:
+        See ``questions``.
+    loss_of:
+        Of the picture of some answers; costly.
+    """
+    losses: dict[Answers, float] = {(): loss_of(())}
+    if not asked:
+        return ()
+    shapes = [
+        [((0, k),) for k in range(shape * len(asked[0]) // SHAPES, (shape + 1) * len(asked[0]) // SHAPES)]
+        for shape in range(SHAPES)
+    ]
+    losses |= {look: loss_of(look) for shape in shapes for look in shape}
+    branches = sorted([(), *(min(shape, key=losses.__getitem__) for shape in shapes)], key=losses.__getitem__)
+    first = losses[branches[0]]
+    # Equal losses are the same cloth: it was closed before.
+    near = [branch for branch in branches[1:] if first < losses[branch] <= NEARLY * first]
+    return min((_climb(asked, branch, losses[branch], loss_of) for branch in [branches[0], *near[:1]]), key=_LOSS)[1]
+
+
+def most_looks(asked: tuple[tuple[Look, ...], ...]) -> int:
+    """How many looks ``best_answers`` takes at most, about."""
+    first, *others = asked or ((),)
+    return 1 + len(first) + round((1.0 + LOOKS_AGAIN) * sum(map(len, others)))
+
+
+_LOSS = itemgetter(0)
+
+
+def _climb(
+    asked: tuple[tuple[Look, ...], ...], answers: Answers, loss: float, loss_of: Callable[[Answers], float]
+) -> tuple[float, Answers]:
+    """From ``answers`` on, the look that gains most, again and again: (loss, answers).
+
+    What a look gains rarely grows by much when others were taken (Minoux 1978): so only those whose gain, as last seen,
+    is within ``SLACK`` of the best are seen again.
+    """
+    waiting = {(q, k): math.inf for q in range(1, len(asked)) for k in range(len(asked[q]))}
+    while waiting:
+        fresh: dict[tuple[int, int], float] = {}
+        for answer in sorted(waiting, key=waiting.__getitem__, reverse=True):
+            if waiting[answer] + SLACK * loss > max(fresh.values(), default=0.0):
+                fresh[answer] = loss - loss_of((*answers, answer))
+        waiting |= fresh
+        if max(fresh.values(), default=0.0) <= 0.0:
+            break
+        best = max(fresh, key=fresh.__getitem__)
+        answers, loss = (*answers, best), loss - fresh[best]
+        waiting = {answer: gain for answer, gain in waiting.items() if answer[0] != best[0]}
+    return loss, answers
 
 
 def _as_lit(seen: Seen) -> Seen:

@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 from usdfab.fabric import FabricParameters
 from usdfab.imaging import denoise
 from usdfab.imaging.lens import photographed
-from usdfab.tracer import Render, RenderSettings, Tracer
+from usdfab.tracer import RenderSettings, Tracer
+from usdfab.tracer.cached_tracer import CachedTracer
+from usdfab.tracer.checkpoint import fingerprint
+from usdfab.tracer.patch_scene import PatchScene, build_tiles, redyed
 from usdfab.usd.rig import Rig, sample_scene
+from usdfab.usd.scene import Camera
 
 if TYPE_CHECKING:
     from usdfab.fit.texture import Target
@@ -23,8 +27,17 @@ Singles = NDArray[np.float32]
 MOST_SPP = 32
 """Samples per pixel beyond which ``spend`` buys no more."""
 
+LEARNING = 0.35
+"""Share of the rays that a radiance cache learns from."""
+
+LEARNED_FROM = 2
+"""How many times smaller the picture is that a radiance cache learns from, along each side."""
+
 VARIED_CELLS = 16
 """Crossings of all variants of the repeat together beyond which pictures show fewer variants."""
+
+KEPT = 16
+"""Latest pictures that are kept: some looks differ only in what the camera does."""
 
 
 class MatchPictures:
@@ -38,11 +51,15 @@ class MatchPictures:
         Pixels along x, samples per pixel before the denoiser, and seed of the renders.
     later_scale:
         Least scale of azimuthal lobes after the first bounce, rad, see ``Tracer``; None: as they are.
+    learning:
+        Samples per pixel of the small picture that a radiance cache learns from (``CachedTracer``); 0: none is used.
     """
 
-    def __init__(self, target: Target, width: int, spp: int, seed: int, later_scale: float | None = None) -> None:
+    def __init__(
+        self, target: Target, width: int, spp: int, seed: int, later_scale: float | None = None, learning: int = 0
+    ) -> None:
         self.target, self.width, self.spp, self.seed = target, width, spp, seed
-        self.later_scale = later_scale
+        self.later_scale, self.learning = later_scale, learning
         weights = []
         for statistic, upper in zip(target.statistics, self._upper(target.statistics), strict=True):
             # Symmetric matrices: each pair off the diagonal stands for two entries.
@@ -53,6 +70,8 @@ class MatchPictures:
         weights.append(np.full(3, 1.0 / 3.0, dtype=np.float32))
         self.weights: Singles = np.concatenate(weights)
         self.mean = target.mean_color.float().reshape(3).numpy()
+        self._kept: dict[str, Singles] = {}
+        self._built: tuple[FabricParameters, list[PatchScene]] | None = None
 
     @staticmethod
     def _upper(statistics: tuple) -> list[tuple[NDArray, NDArray]]:
@@ -61,25 +80,56 @@ class MatchPictures:
     def spend(self, rays: float, fabric: FabricParameters, rig: Rig | None) -> None:
         """Raise ``spp`` to what so many rays a pixel pay for: paths end soon in dark cloth.
 
-        Deterministic: the rays of a small picture of the fabric are counted.
+        A radiance cache gets its share of them. Deterministic: the rays of a small picture of the fabric are counted.
         """
-        probe = self._render(fabric, rig, max(16, self.width // 6), 2)
-        each = probe.rays / max(float(probe.samples.sum()), 1.0)
-        self.spp = max(self.spp, min(int(rays / max(each, 1.0)), MOST_SPP))
+        tracer, camera = self._tracer(fabric, rig)
+        probe = self._settings(fabric, max(16, self.width // 6), 2)
+        render = tracer.render(camera, probe)
+        each = max(render.rays / max(float(render.samples.sum()), 1.0), 1.0)
+        if self.learning:
+            self.learning = max(self.learning, min(int(LEARNING * rays * LEARNED_FROM**2 / each), MOST_SPP))
+            rays = (1.0 - LEARNING) * rays
+            render = CachedTracer(tracer, camera, probe).render(camera, probe)
+            each = max(render.rays / max(float(render.samples.sum()), 1.0), 1.0)
+        self.spp = max(self.spp, min(int(rays / each), MOST_SPP))
 
     def picture(self, fabric: FabricParameters, rig: Rig | None) -> Singles:
-        """(H, W, 3) linear, denoised, at exposure 1."""
-        render = self._render(fabric, rig, self.width, self.spp)
+        """(H, W, 3) linear, denoised, at exposure 1, without the rig's blur."""
+        sharp = replace(rig, blur=0.0) if rig else None
+        key = fingerprint(fabric, sharp, self.seed)
+        if key not in self._kept:
+            self._kept[key] = self._rendered(fabric, sharp)
+            while len(self._kept) > KEPT:
+                del self._kept[next(iter(self._kept))]
+        return self._kept[key]
+
+    def _rendered(self, fabric: FabricParameters, rig: Rig | None) -> Singles:
+        tracer, camera = self._tracer(fabric, rig)
+        settings = self._settings(fabric, self.width, self.spp)
+        if self.learning:
+            # Other paths than the picture's.
+            small = replace(self._settings(fabric, self.width // LEARNED_FROM, self.learning), seed=self.seed + 1000)
+            render = CachedTracer(tracer, camera, small).render(camera, settings)
+        else:
+            render = tracer.render(camera, settings)
         return denoise(render.pixels, render.albedo, render.normal)
 
-    def _render(self, fabric: FabricParameters, rig: Rig | None, width: int, spp: int) -> Render:
+    def _tracer(self, fabric: FabricParameters, rig: Rig | None) -> tuple[Tracer, Camera]:
         repeat = math.prod(fabric.repeat())
         # Statistics need only so many different crossings; each is fibers to build and to keep.
         fewer = replace(fabric, variants=max(1, min(fabric.variants, VARIED_CELLS // repeat)))
         scene = sample_scene(fewer, rig)
+        return Tracer(scene, later_scale=self.later_scale, build=self._tiles), scene.cameras[0]
+
+    def _tiles(self, fabric: FabricParameters) -> list[PatchScene]:
+        """The fabric's tiles; where only its optics have changed, the same fibers as the last time."""
+        tiles = redyed(self._built[1], self._built[0], fabric) if self._built else None
+        self._built = fabric, tiles or build_tiles(fabric)
+        return self._built[1]
+
+    def _settings(self, fabric: FabricParameters, width: int, spp: int) -> RenderSettings:
         size = (width, max(1, round(width * fabric.size[1] / fabric.size[0])))
-        tracer = Tracer(scene, later_scale=self.later_scale)
-        return tracer.render(scene.cameras[0], RenderSettings(size, spp=spp, seed=self.seed))
+        return RenderSettings(size, spp=spp, seed=self.seed)
 
     def residuals(self, picture: Singles, exposure: float, blur: float = 0.0) -> Singles:
         """What differs at an exposure, through a camera whose blur is given in pixels (``imaging.lens``).

@@ -85,7 +85,7 @@ def run_match(
         notes.append(f"the match stage was interrupted after {max(0, len(result.losses) - 1)} steps")
     say("judging the match stage", steps - 1, steps)
     # Other draws than those that were matched.
-    after = stages.traced_distance(result.fabric, judged, judge, net, settings.seed + 1, result.exposure, result.rig)
+    after = stages.traced_distance(result.fabric, judged, judge, net, settings.seed + 2, result.exposure, result.rig)
     found, light, lamps, unsure = result.fabric, result.exposure, result.rig, result.uncertainty
     if not after < before:
         notes.append(f"the match stage did not come closer to the photo ({before:.3f}, then {after:.3f}): not used")

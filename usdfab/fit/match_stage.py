@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
-from usdfab.fit.match_looks import Seen, looks_at, questions
+from usdfab.fit.match_looks import Answers, Seen, best_answers, looks_at, most_looks, questions
 from usdfab.fit.match_pictures import MatchPictures
 from usdfab.fit.match_space import BLUR, EXPOSURE, MOVES, OF_THE_CAMERA, MatchSpace
 from usdfab.fit.match_steps import broyden_update, damped_step, normal_equations, soft_l1
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-FORMAT = "usdfab-match/4"
+FORMAT = "usdfab-match/5"
 LONGEST_STEP = 2.0
 DAMPINGS = (0.01, 0.1, 1.0, 10.0)
 """Tried one after another until a step leads down; each iteration begins with the one that last did."""
@@ -66,6 +66,8 @@ class MatchSettings:
     later_scale:
         Least scale of fibers' azimuthal lobes after the first bounce, rad, in these pictures (``Tracer``): less noise,
         while the brightness stays within about 2 %.
+    learning:
+        Samples per pixel, at least, that the pictures' radiance cache learns from, see ``MatchPictures``; 0: none.
     iterations:
         Rounds of finite differences.
     steps:
@@ -84,6 +86,7 @@ class MatchSettings:
     spp: int = 4
     rays: int = 0
     later_scale: float | None = None
+    learning: int = 0
     iterations: int = 2
     steps: int = 3
     levels: tuple[int, ...] = (1, 2, 4)
@@ -98,7 +101,7 @@ class MatchSettings:
         systems, channels = 2, 3
         moving = [name for name in self.free if name not in OF_THE_CAMERA]
         coordinates = systems * (len(moving) + (channels - 1 if "albedo" in moving else 0))
-        looks = 1 + sum(map(len, questions(self.shapes, rig_known=False)))
+        looks = most_looks(questions(self.shapes, rig_known=False))
         return looks + self.iterations * (coordinates + self.steps * len(DAMPINGS))
 
     @property
@@ -122,9 +125,9 @@ SOFTER = 0.15
 """``later_scale`` of all qualities."""
 
 QUALITIES: dict[str, MatchSettings] = {
-    "draft": MatchSettings(width=192, spp=4, rays=100, later_scale=SOFTER, iterations=1, free=DRAFTED),
-    "standard": MatchSettings(rays=200, later_scale=SOFTER),
-    "paper": MatchSettings(width=360, spp=16, rays=500, later_scale=SOFTER, iterations=4, levels=(1, 2, 4)),
+    "draft": MatchSettings(width=192, rays=50, later_scale=SOFTER, learning=1, iterations=1, free=DRAFTED),
+    "standard": MatchSettings(rays=150, later_scale=SOFTER, learning=1),
+    "paper": MatchSettings(width=360, spp=16, rays=500, later_scale=SOFTER, learning=1, iterations=4),
 }
 """What ``--quality`` means here."""
 
@@ -162,10 +165,21 @@ class _State:
     round: int
     point: Floats
     losses: list[float]
-    answers: tuple[int, ...] = ()
+    answers: Answers = ()
     light: float = 1.0
     damping: int = 0
     deviations: Floats | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """Answers to the first questions, the light (a factor of the exposure) that suits them, and what is seen."""
+
+    answers: Answers
+    light: float
+    picture: Singles
+    residuals: Singles
+    loss: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +235,9 @@ def match_photo(
 
     picture = torch.from_numpy(np.ascontiguousarray(goal, dtype=np.float32)).permute(2, 0, 1)
     target = Target.from_image(picture, net, settings.levels, settings.kind)
-    pictures = MatchPictures(target, settings.width, settings.spp, settings.seed, settings.later_scale)
+    pictures = MatchPictures(
+        target, settings.width, settings.spp, settings.seed, settings.later_scale, settings.learning
+    )
     if settings.rays:
         pictures.spend(settings.rays, start, rig)
     identity = fingerprint(start, np.asarray(goal, dtype=np.float32), settings, float(exposure), rig, rig_known)
@@ -268,51 +284,55 @@ class _Search:
         self.state = state or _State(0, np.zeros(len(self.space.names)), [])
         self._progress = progress or (lambda *_: None)
         self._each = len(self.space.names) + settings.steps * len(DAMPINGS)
+        self._looks = most_looks(self.questions)
         self._done = self.state.round * self._each
         self.loss = math.inf
-        self._seen: list[Seen] = []
 
     def begin(self) -> None:
         """Take the first looks, or go back to the point where the search stood."""
         state, exposure = self.state, self.space.light
         if not self.fresh:
+            self._done += self._looks
             self._settle(exposure)
-            self._done += sum(map(len, self.questions))
-            self.picture, self.residuals, self.loss = self._look(state.point)
             return
-        self._try((), exposure)
-        state.losses.append(self.loss)
-        for question in self.questions:
-            before, kept = self.loss, state.answers
-            state.answers = (*kept, -1)
-            for answer in range(len(question)):
-                self._try((*kept, answer), exposure)
-            if self.loss < before:
-                state.losses.append(self.loss)
+        looks: dict[Answers, _Look] = {}
+
+        def loss_of(answers: Answers) -> float:
+            looks[answers] = self._look_as(answers, exposure)
+            return looks[answers].loss
+
+        best = looks[best_answers(self.questions, loss_of)]
+        state.losses.append(looks[()].loss)
+        if best.loss < state.losses[0]:
+            state.losses.append(best.loss)
+        state.answers, state.light = best.answers, best.light
         self._settle(exposure)
 
-    def _try(self, answers: tuple[int, ...], exposure: float) -> None:
-        """Look at some answers in several lights; the start also in its own."""
+    def _look_as(self, answers: Answers, exposure: float) -> _Look:
+        """What is seen with some answers, in the light in which it comes closest; the start also in its own."""
         seen = looks_at(self.start, self.questions, answers)
         self._done += 1
-        if answers and seen in self._seen:
-            return
-        self._seen.append(seen)
         picture = self.pictures.picture(seen.fabric, seen.rig)
         mean = float(self.pictures.mean.mean()) / max(exposure * float(picture.mean()), 1e-6)
+        found = []
         for light in (*(mean * factor for factor in LIGHTS), *(() if answers else (1.0,))):
             residuals = self.pictures.residuals(picture, exposure * light, blur_in_pixels(seen.rig, self.scale))
-            loss = soft_l1(residuals, self.pictures.weights)
-            if loss < self.loss:
-                self.picture, self.residuals, self.loss = picture, residuals, loss
-                self.state.answers, self.state.light = answers, light
+            found.append(_Look(answers, light, picture, residuals, soft_l1(residuals, self.pictures.weights)))
+        best = min(found, key=lambda look: look.loss)
+        self.loss = min(self.loss, best.loss)
         self._tell(self.loss)
+        return best
 
     def _settle(self, exposure: float) -> None:
+        """Go to the point where the search stands, from the looks that were found best."""
         seen = looks_at(self.start, self.questions, self.state.answers)
         blur = seen.rig.blur if seen.rig else 0.0
         self.space = replace(self.space, start=seen.fabric, light=exposure * self.state.light, blur=blur)
         self.rig = seen.rig
+        if self.questions:
+            # The best of many looks owes something to its noise, which steps would have to beat.
+            self.pictures.seed = self.settings.seed + 1
+        self.picture, self.residuals, self.loss = self._look(self.state.point)
 
     def rig_at(self, point: Floats) -> Rig | None:
         """Camera and lamps at a point; None is the paper's rig, which is sharp."""
@@ -403,7 +423,7 @@ def _arrays(state: _State) -> dict[str, NDArray]:
 
 def _state(arrays: dict[str, NDArray]) -> _State:
     return _State(
-        int(arrays["round"]), arrays["point"], arrays["losses"].tolist(), tuple(arrays["answers"].tolist()),
+        int(arrays["round"]), arrays["point"], arrays["losses"].tolist(), tuple((q, k) for q, k in arrays["answers"].reshape(-1, 2).tolist()),
         float(arrays["light"]), int(arrays["damping"]), arrays["deviations"],
     )  # fmt: skip
 

@@ -63,7 +63,7 @@ def fit_photo(
     pixel_size: float | None = None,
     seed: int = 0,
     progress: Progress | None = None,
-    albedo_paths: int = PATHS,
+    albedo_paths: int | None = None,
     *,
     stages: Sequence[str] = ("analysis",),
     quality: str = "draft",
@@ -87,7 +87,8 @@ def fit_photo(
     progress:
         Called with steps of all stages together.
     albedo_paths:
-        Paths in each render by which albedos are found; fewer are faster and noisier.
+        Paths in each render by which albedos are found; fewer are faster and noisier. By default ``PATHS``, and a
+        third of these if the match stage moves the albedos afterwards.
     stages, quality:
         Which of ``stages.STAGES`` run; resolution and iterations of those after the analysis: draft, standard, paper.
     crop:
@@ -111,6 +112,8 @@ def fit_photo(
         for a checkpoint of another fit.
     """
     wanted = checked_stages(stages)
+    if albedo_paths is None:
+        albedo_paths = PATHS // 3 if "match" in wanted else PATHS
     later = LaterStages.of(wanted, quality, seed, albedo_paths, checkpoint, rig)
     if rig is not None and width is None and pixel_size is None:
         photo = replace(load_photo(path, rig.sample_size[0], None, crop), size_source="the rig")

@@ -124,7 +124,7 @@ class DifferentiableTracer:
 
         def tile(window: Window) -> Floats:
             film, squares = _zeros(window, CHANNELS), _zeros(window, 3)
-            render_tile(world, self._view, np.uint64(seed), window, 0, spp, self.max_depth, film, squares)
+            render_tile(world, self._view, np.uint64(seed), window, 0, spp, self.max_depth, film, squares, None)
             return film[..., RGB : RGB + 3]
 
         image = np.zeros((self.size[1], self.size[0], 3))

@@ -39,7 +39,7 @@ def gradient_tile(world, view, seed, window, samples, max_depth, slopes, owners,
             tape = Tape(borrow(slopes), borrow(owners), score, drift, keep, pixel)
             for sample in range(samples):
                 stream, time, ox, oy, oz, dx, dy, dz = camera_sample(view, seed, shift_x, shift_y, row, column, sample)
-                trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, sample == 0, out, tape)
+                trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, sample == 0, out, tape, None)
     # Numba frees an array after its last use: this is after the last path.
     memory[1][0] = np.uint32(0)
     own[0] = fading[0] = 0.0

@@ -36,6 +36,7 @@ from usdfab.tracer.counted import next_uniform
 from usdfab.tracer.film import ALBEDO, ALPHA, DEPTH, DIRECT, FIBER_ID, NORMAL, RAYS, SAMPLES, UV, YARN_ID
 from usdfab.tracer.intrinsics import ENTRY, KERNEL, PRIM, borrow, new_ray_buffer
 from usdfab.tracer.lights import FAR, escaped_radiance, hit_light, light_blocks, sample_light
+from usdfab.tracer.radiance_cache import borrowed_cache, box_at
 from usdfab.tracer.slab import HIT, enter_slab, inverse_columns, leave_slab, to_patch, trace_slab
 from usdfab.tracer.surfaces import MAX_SURFACES, light_share, surface_frame, trace_macro, transmittance
 from usdfab.tracer.tangents import radius_at
@@ -61,12 +62,12 @@ _NO_SLOPES = (0.0,) * PREPARED_SLOPES
 
 
 @njit(**KERNEL)
-def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, set_ids, out, tape):
+def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, set_ids, out, tape, cache):
     """Radiance along a camera ray. Adds to ``out``, the film's channels of the pixel.
 
     With a ``Tape`` it adds derivatives to that; with None Numba leaves all of that out of what it compiles. The path is
     the same either way; its weights are not, but in the mean: with lamps that have an extent, and with narrow lobes,
-    whose light only paths without a tape aim (``aimed.py``).
+    whose light only paths without a tape aim (``aimed.py``). With a ``RadianceCache`` the path ends there, or fills it.
     """
     macro, patches, lights = world.macro, world.patches, world.lights
     light_count = len(lights.table)
@@ -89,6 +90,7 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
     travelled = 0.0
     flight, sent = NO_FLIGHT, False
     tx = ty = 0.0
+    box = nowhere
     if tape is not None:
         start_tape(tape)
 
@@ -237,6 +239,17 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
             first = False
         if depth >= max_depth:
             break
+        if cache is not None:  # noqa: SIM102
+            if fiber and depth >= cache.depth and box < 0:
+                box = box_at(cache, row, m[6] * dx + m[7] * dy + m[8] * dz > 0.0, lx, ly, lz)
+                if len(cache.sums) == 0:
+                    total_r += beta_r * cache.radiance[box, 0]
+                    total_g += beta_g * cache.radiance[box, 1]
+                    total_b += beta_b * cache.radiance[box, 2]
+                    break
+                sums = cache.sums[box]
+                sums[0], sums[1], sums[2] = sums[0] - total_r, sums[1] - total_g, sums[2] - total_b
+                sums[3], sums[4], sums[5] = sums[3] + beta_r, sums[4] + beta_g, sums[5] + beta_b
 
         # Direct light: next-event estimation.
         if light_count > 0:
@@ -353,6 +366,10 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
             if u0 >= survive:
                 break
             beta_r, beta_g, beta_b = beta_r / survive, beta_g / survive, beta_b / survive
+    if cache is not None:  # noqa: SIM102  Numba leaves out a branch that asks for nothing else
+        if box >= 0 and len(cache.sums) > 0:
+            sums = cache.sums[box]
+            sums[0], sums[1], sums[2] = sums[0] + total_r, sums[1] + total_g, sums[2] + total_b
     out[0], out[1], out[2] = out[0] + total_r, out[1] + total_g, out[2] + total_b
     out[DIRECT], out[DIRECT + 1] = out[DIRECT] + direct_r, out[DIRECT + 1] + direct_g
     out[DIRECT + 2] += direct_b
@@ -360,7 +377,7 @@ def trace_path(world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, s
 
 
 @njit(**ENTRY, nogil=True)
-def render_tile(world, view, seed, window, first_sample, samples, max_depth, film, squares):
+def render_tile(world, view, seed, window, first_sample, samples, max_depth, film, squares, cache):
     """Add samples to the pixels of ``window`` (x0, y0, x1, y1).
 
     Runs without Python's lock, so that threads can share the work; a pixel belongs to one call at a time and its
@@ -374,10 +391,12 @@ def render_tile(world, view, seed, window, first_sample, samples, max_depth, fil
         Sums over samples, see ``film.py``; a view of the window's own pixels.
     squares: (y1 - y0, x1 - x0, 3)
         Sums of the squares of RGB.
+    cache:
+        A ``RadianceCache`` to fill or to end paths at, or None.
     """
     memory = new_ray_buffer(world.embree[2])
     buffer = (borrow(memory[0]), borrow(memory[1]), memory[2])
-    world = borrowed(world)
+    world, store = borrowed(world), borrowed_cache(cache)
     for row in range(window[1], window[3]):
         for column in range(window[0], window[2]):
             shift_x, shift_y = pixel_shift(seed, row * view.width + column)
@@ -386,7 +405,7 @@ def render_tile(world, view, seed, window, first_sample, samples, max_depth, fil
             for sample in range(first_sample, first_sample + samples):
                 stream, time, ox, oy, oz, dx, dy, dz = camera_sample(view, seed, shift_x, shift_y, row, column, sample)
                 red, green, blue = trace_path(
-                    world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, sample == 0, out, None
+                    world, buffer, stream, time, ox, oy, oz, dx, dy, dz, max_depth, sample == 0, out, None, store
                 )
                 out[SAMPLES] += 1.0
                 square[0] += red * red

@@ -7,9 +7,11 @@ between some of the spline's knots (``knots.py``), with its tangent at each vert
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 from usdfab.fabric import FabricParameters, YarnParameters
 from usdfab.fabric.fabric import SYSTEMS
 from usdfab.fibers import FiberSystem, OpenCurves, Patch, generate_patch, patch_variants
+from usdfab.fibers.shades import LEVELS, shaded_albedo
 from usdfab.fibers.tiles import tile_copies
 from usdfab.scattering.fiber_numba import pack_fiber
 from usdfab.scattering.roughness import absorption_from_albedo
@@ -75,6 +78,68 @@ def build_tiles(fabric: FabricParameters) -> list[PatchScene]:
     patches = patch_variants(fabric, copies=tile_copies(fabric))
     with ThreadPoolExecutor(min(len(patches), os.cpu_count() or 1)) as pool:
         return list(pool.map(partial(build_patch_scene, fabric), patches))
+
+
+def redyed(tiles: Sequence[PatchScene], before: FabricParameters, after: FabricParameters) -> list[PatchScene] | None:
+    """The ``tiles`` of one fabric as those of another that differs in optics only, without building fibers again.
+
+    None where that cannot be: fibers of one colour would get several, or the fabrics differ in more than colours,
+    ``albedo_variation`` (if both vary), roughnesses, index and tilt of the cuticle.
+    """
+    if _undyed(before) != _undyed(after):
+        return None
+    colors: dict[tuple[int, tuple[float, ...]], tuple[float, ...]] = {}
+    for index, system in enumerate(SYSTEMS):
+        old, new = (_shades(fabric.system(system)) for fabric in (before, after))
+        for a, b in zip(old, new, strict=True):
+            if colors.setdefault((index, a), b) != b:
+                return None
+    result = []
+    for tile in tiles:
+        own = [
+            pack_material(after.system(SYSTEMS[system]), colors[system, _as_key(color)])
+            for system, color in zip(tile.systems.tolist(), tile.albedo[:, :3], strict=True)
+        ]
+        result.append(
+            replace(tile, materials=np.stack([m for m, _ in own]), albedo=np.asarray([a for _, a in own]))
+        )  # fmt: skip
+    return result
+
+
+_OPTICS: dict[str, Any] = {
+    "roughness_longitudinal": 0.5,
+    "roughness_azimuthal": 0.5,
+    "roughness_primary": 0.5,
+    "cuticle_tilt": 0.0,
+}
+
+
+def _undyed(fabric: FabricParameters) -> FabricParameters:
+    """The fabric without what ``redyed`` changes."""
+    for system in SYSTEMS:
+        yarn = fabric.system(system)
+        plain = replace(
+            yarn, **_OPTICS, ior=1.5, albedo=(0.5, 0.5, 0.5), yarn_albedo=((0.5, 0.5, 0.5),) * len(yarn.yarn_albedo),
+            albedo_variation=0.5 if yarn.albedo_variation > 0.0 else 0.0,
+        )  # fmt: skip
+        fabric = replace(fabric, **{system: plain})  # type: ignore[arg-type]
+    return fabric
+
+
+def _shades(yarn: YarnParameters) -> list[tuple[float, ...]]:
+    """Albedos of all fibers of a yarn system."""
+    colors = np.asarray(yarn.colors(), dtype=float)
+    if yarn.albedo_variation > 0.0:
+        levels = np.arange(len(LEVELS))
+        colors = np.concatenate([
+            shaded_albedo(np.tile(color, (len(LEVELS), 1)), yarn.albedo_variation, levels) for color in colors
+        ])  # fmt: skip
+    return [_as_key(color) for color in colors]
+
+
+def _as_key(color: NDArray[np.float64]) -> tuple[float, ...]:
+    """A colour without its last digits, which depend on how many were computed at once."""
+    return tuple(np.round(color, 12).tolist())
 
 
 def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> PatchScene:

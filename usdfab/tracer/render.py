@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -36,6 +36,7 @@ from usdfab.tracer.lights import pack_lights
 from usdfab.tracer.macro_scene import Tiles, build_macro
 from usdfab.tracer.memory import check_memory
 from usdfab.tracer.patch_scene import PatchScene, build_tiles
+from usdfab.tracer.radiance_cache import RadianceCache
 from usdfab.tracer.schedule import Window, Work, bounds, plan_tiles, relative_error
 from usdfab.tracer.textures import load_texture_images, pack_materials, pack_textures
 from usdfab.tracer.world import MATERIAL, PATCH_COLUMNS, Patches, View, World
@@ -123,6 +124,7 @@ class Tracer:
         textures: Mapping[str, NDArray] | None = None,
         strict: bool = False,
         later_scale: float | None = None,
+        build: Callable[[FabricParameters], list[PatchScene]] = build_tiles,
     ) -> None:
         """Build tiles, meshes, materials and lights.
 
@@ -135,6 +137,8 @@ class Tracer:
         later_scale:
             Least scale, rad, of the azimuthal lobes of fibers at all bounces but the first (``soften_fiber``): a
             fraction of the noise, and what light does deep in the cloth is a little blurred. None: as they are.
+        build:
+            What makes the tiles of a fabric.
         """
         glow = any(np.any(m.emissive) or "emissiveColor" in m.textures for m in scene.materials if m.fabric < 0)
         if not scene.lights and not glow:
@@ -147,7 +151,7 @@ class Tracer:
         for surface in scene.fabrics:
             if surface.fabric not in fabrics:
                 fabrics.append(surface.fabric)
-                built = build_tiles(surface.fabric)
+                built = build(surface.fabric)
                 tiles_of[len(fabrics) - 1] = Tiles(len(self._tiles), len(built))
                 self._tiles += built
                 owners += [surface.fabric] * len(built)
@@ -185,28 +189,48 @@ class Tracer:
         """Fiber segments in memory, whatever the cloth's area."""
         return sum(len(s.segments) for s in self._tiles)
 
-    def sample(self, shot: Shot, window: Window, first: int, samples: int, sums: Sums) -> Sums:
+    def sample(
+        self, shot: Shot, window: Window, first: int, samples: int, sums: Sums, cache: RadianceCache | None = None
+    ) -> Sums:
         """The sums (h, w, LAYERS) of a window with samples ``first`` to ``first + samples`` added; ``sums`` is kept.
 
         A pure function: the same on any machine of the same kind, and the same however samples are divided among calls.
+        With a ``cache``, paths end there; one that learns is filled.
         """
         film, squares = sums[..., :CHANNELS].copy(), sums[..., CHANNELS:].copy()
-        close = shot.camera.to_world_close
-        moves = self._moves or (close is not None and not np.array_equal(close, shot.camera.to_world))
-        view = pack_view(shot.camera, shot.width, shot.height, moves)
-        render_tile(self.world, view, np.uint64(shot.seed), window, first, samples, shot.max_depth, film, squares)
+        render_tile(
+            self.world, self.view(shot), np.uint64(shot.seed), window, first, samples, shot.max_depth, film, squares,
+            cache,
+        )  # fmt: skip
         return np.concatenate([film, squares], axis=-1)
 
     def render(self, camera: Camera, settings: RenderSettings, progress: Progress | None = None) -> Render:
         """Render what a camera sees. An interrupt (Ctrl-C) takes effect within a few tiles."""
-        shot, work = start(camera, settings)
-        with ThreadRunner(partial(self.sample, shot), thread_count(settings.threads)) as runner:
-            seconds = accumulate(
-                work, runner, settings.spp, noise=settings.noise, gain=2.0**camera.exposure,
-                time_limit=settings.time_limit, progress=progress,
-            )  # fmt: skip
-        region, size = resolve_region(settings.region, shot.width, shot.height), (shot.width, shot.height)
-        return develop(work, region, size, camera.exposure, seconds, self.segments)
+        return render_by(self.sample, camera, settings, self.segments, progress)
+
+    def view(self, shot: Shot) -> View:
+        """A shot's camera as kernels read it."""
+        close = shot.camera.to_world_close
+        moves = self._moves or (close is not None and not np.array_equal(close, shot.camera.to_world))
+        return pack_view(shot.camera, shot.width, shot.height, moves)
+
+
+def render_by(
+    sample: Callable[[Shot, Window, int, int, Sums], Sums],
+    camera: Camera,
+    settings: RenderSettings,
+    segments: int,
+    progress: Progress | None = None,
+) -> Render:
+    """Render with ``Tracer.sample`` or another like it."""
+    shot, work = start(camera, settings)
+    with ThreadRunner(partial(sample, shot), thread_count(settings.threads)) as runner:
+        seconds = accumulate(
+            work, runner, settings.spp, noise=settings.noise, gain=2.0**camera.exposure,
+            time_limit=settings.time_limit, progress=progress,
+        )  # fmt: skip
+    region, size = resolve_region(settings.region, shot.width, shot.height), (shot.width, shot.height)
+    return develop(work, region, size, camera.exposure, seconds, segments)
 
 
 def thread_count(threads: int | None) -> int:
