@@ -24,7 +24,9 @@ from usdfab.fit.match_looks import (
     TURNS,
     WIDTHS,
     Seen,
+    best_answers,
     looks_at,
+    most_looks,
     questions,
 )
 from usdfab.fit.match_stage import MatchSettings, match_photo
@@ -123,10 +125,57 @@ def test_questions_and_answers() -> None:
     start = Seen(CLOTH, None)
     asked = questions(True, rig_known=False)
     assert looks_at(start, asked, ()) == start
-    assert looks_at(start, asked, (-1, -1, -1)) == start
-    both = looks_at(start, asked, (1, 1))
+    both = looks_at(start, asked, ((0, 1), (1, 1)))
     assert both.rig == ring_rig(CLOTH.size, RING_ELEVATIONS[0])
     assert both.fabric == WIDTH[1](SHAPE[0](start)).fabric
+    # In the order of the answers: yarns that have plies keep their twist.
+    spun, plied = (4, 0), (5, 0)
+    first, last = (looks_at(start, asked, order).fabric.warp for order in ((spun, plied), (plied, spun)))
+    assert first.ply_count == last.ply_count == 2 and first.twist != last.twist == CLOTH.warp.twist
+
+
+ASKED = questions(True, rig_known=False)
+
+
+class _Losses:
+    """Of answers: each look gains something of its own, whatever was answered before, unless told otherwise."""
+
+    def __init__(self, gains: dict[tuple[int, int], float], special: dict[tuple, float] | None = None) -> None:
+        self.gains, self.special, self.asked = gains, special or {}, []
+
+    def __call__(self, answers: tuple) -> float:
+        self.asked.append(answers)
+        return self.special.get(answers, 1.0 - sum(self.gains.get(answer, -0.1) for answer in answers))
+
+
+def test_the_look_that_helps_most_comes_first() -> None:
+    losses = _Losses({(0, 3): 0.3, (5, 0): 0.2, (3, 1): 0.1, (4, 2): 0.05, (4, 3): 0.04})
+    assert best_answers(ASKED, losses) == ((0, 3), (5, 0), (3, 1), (4, 2))
+    # No look is taken twice with the same answers before it, and few are taken again.
+    assert len(losses.asked) == len(set(losses.asked)) <= most_looks(ASKED)
+    assert best_answers((), losses) == ()
+
+
+def test_looks_that_help_only_without_each_other_are_not_both_taken() -> None:
+    gains = {(0, 3): 0.3, (5, 0): 0.2, (4, 2): 0.15}
+    together = {((0, 3), (5, 0), (4, 2)): 0.6}
+    assert best_answers(ASKED, _Losses(gains, together)) == ((0, 3), (5, 0))
+
+
+def test_another_shape_that_comes_nearly_as_close_is_followed_too() -> None:
+    """Closed cloth (looks from the middle on) is a little worse at first, and best with flyaways."""
+    half = len(SHAPE) // 2
+    gains = {(0, 1): 0.3, (0, half + 1): 0.28}
+    special = {((0, half + 1), (8, 0)): 0.5}
+    assert best_answers(ASKED, _Losses(gains, special)) == ((0, half + 1), (8, 0))
+    # Not where it is far off.
+    gains[0, half + 1] = 0.1
+    assert best_answers(ASKED, _Losses(gains, special)) == ((0, 1),)
+
+
+def test_where_no_shape_helps_the_start_keeps_its_own() -> None:
+    losses = _Losses({(5, 0): 0.2})
+    assert best_answers(ASKED, losses) == ((5, 0),)
 
 
 def test_closed_cloth_is_found_from_open_one(net: FeatureNet) -> None:

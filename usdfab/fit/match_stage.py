@@ -107,7 +107,7 @@ class MatchSettings:
     @property
     def samples(self) -> float:
         """Samples per pixel that cost what a picture costs, about, in cloth neither dark nor white."""
-        return max(float(self.spp), self.rays / RAYS_PER_PATH)
+        return self.rays / RAYS_PER_PATH if self.rays else float(self.spp)
 
     @property
     def shapes(self) -> bool:
@@ -422,9 +422,10 @@ def _arrays(state: _State) -> dict[str, NDArray]:
 
 
 def _state(arrays: dict[str, NDArray]) -> _State:
+    answers = tuple((question, look) for question, look in arrays["answers"].reshape(-1, 2).tolist())
     return _State(
-        int(arrays["round"]), arrays["point"], arrays["losses"].tolist(), tuple((q, k) for q, k in arrays["answers"].reshape(-1, 2).tolist()),
-        float(arrays["light"]), int(arrays["damping"]), arrays["deviations"],
+        int(arrays["round"]), arrays["point"], arrays["losses"].tolist(), answers, float(arrays["light"]),
+        int(arrays["damping"]), arrays["deviations"],
     )  # fmt: skip
 
 

@@ -30,8 +30,8 @@ STAGES = ("analysis", "network", "raster", "match", "path")
 
 JUDGE_PATHS_PER_PIXEL = 12
 """Of the pictures by which a stage's result is judged, before the denoiser, and of half as large ones from which their
-radiance cache learns. Undenoised, noise that is clipped at white outweighs the fit: on white yarns the distance was 0.82
-at 16 samples of whole paths and 0.68 at 64, 0.58 without noise."""
+radiance cache learns. Undenoised, noise that is clipped at white outweighs the fit: on white yarns the distance was
+0.82 at 16 samples of whole paths and 0.68 at 64, 0.58 without noise."""
 
 Progress = Callable[[str, int, int], None]
 
