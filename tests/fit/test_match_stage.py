@@ -18,7 +18,7 @@ from usdfab.fit.features import FeatureNet
 from usdfab.fit.match_pictures import MOST_SPP, MatchPictures
 from usdfab.fit.match_run import run_match
 from usdfab.fit.match_space import BLUR, BLUR_UNIT, EXPOSURE, MOVES, MatchSpace, Move
-from usdfab.fit.match_stage import MatchResult, MatchSettings, checked_match_quality, match_photo
+from usdfab.fit.match_stage import MatchPoint, MatchResult, MatchSettings, checked_match_quality, match_photo
 from usdfab.fit.match_steps import SOFT, broyden_update, damped_step, normal_equations, soft_l1
 from usdfab.fit.raster_stage import StageSettings
 from usdfab.fit.texture import Target
@@ -207,10 +207,13 @@ def test_ctrl_c_keeps_the_best_so_far(
 def test_the_stage_is_used_only_where_it_comes_closer(
     net: FeatureNet, goal: np.ndarray, monkeypatch: pytest.MonkeyPatch, closer: bool
 ) -> None:
-    result = MatchResult(replace(CLOTH, name="Matched"), 1.4, (1.0, 0.5), {"warp.crimp": 0.1}, False)
+    way = (MatchPoint(replace(CLOTH, name="Matched"), 1.4), MatchPoint(replace(CLOTH, name="Lucky"), 1.5))
+    result = MatchResult(way, (1.0, 0.5), {"warp.crimp": 0.1}, False)
     monkeypatch.setattr(features, "load_features", lambda *_, **__: net)
     monkeypatch.setattr(match_stage, "match_photo", lambda *_, **__: result)
-    monkeypatch.setattr("usdfab.fit.stages.traced_distance", lambda *_: 0.3 if closer else 0.9)
+    # The last point is the best of the stage's own pictures, but not seen better.
+    distances = {"Matched": 0.3 if closer else 0.9, "Lucky": 0.4 if closer else 0.95}
+    monkeypatch.setattr("usdfab.fit.stages.traced_distance", lambda fabric, *_: distances[fabric.name])
     judge = StageSettings(width=32, supersampling=1, iterations=1, levels=(1,))
     before, outcome = run_match(wrong(), goal, 0.0, SMALL, judge, exposure=1.2, distance=0.5)
     assert before == 0.5

@@ -6,6 +6,7 @@ z = 0. Metres.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -305,7 +306,8 @@ def yarn_systems(
 def _patch(systems: tuple[YarnSystem, YarnSystem], variant: int) -> Patch:
     if variant < 0:
         raise ValueError(f"variants are numbered from 0, not {variant}")
-    warp, weft = (s.fibers(variant) for s in systems)
+    with ThreadPoolExecutor(2) as pool:
+        warp, weft = pool.map(lambda s: s.fibers(variant), systems)
     flyaways = tuple(f for f in (s.flyaways(variant) for s in systems) if f is not None)
     return Patch(systems[0].size, warp, weft, flyaways)
 

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str, int, int], None]
 
+MOST_JUDGED = 5
+"""Of the points that the stage took, the last ones, one of which is the result."""
+
 
 def run_match(
     start: FabricParameters,
@@ -84,9 +87,14 @@ def run_match(
     if result.interrupted:
         notes.append(f"the match stage was interrupted after {max(0, len(result.losses) - 1)} steps")
     say("judging the match stage", steps - 1, steps)
-    # Other draws than those that were matched.
-    after = stages.traced_distance(result.fabric, judged, judge, net, settings.seed + 2, result.exposure, result.rig)
-    found, light, lamps, unsure = result.fabric, result.exposure, result.rig, result.uncertainty
+    # Other draws than those that were matched, and more of them: what came closer there by its noise does not here.
+    way = result.way[-MOST_JUDGED:]
+    distances = [
+        stages.traced_distance(p.fabric, judged, judge, net, settings.seed + 2, p.exposure, p.rig) for p in way
+    ]
+    after = min(distances)
+    best = way[distances.index(after)]
+    found, light, lamps, unsure = best.fabric, best.exposure, best.rig, result.uncertainty
     if not after < before:
         notes.append(f"the match stage did not come closer to the photo ({before:.3f}, then {after:.3f}): not used")
         found, light, lamps, unsure = start, exposure, rig, {}

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-FORMAT = "usdfab-match/5"
+FORMAT = "usdfab-match/6"
 LONGEST_STEP = 2.0
 DAMPINGS = (0.01, 0.1, 1.0, 10.0)
 """Tried one after another until a step leads down; each iteration begins with the one that last did."""
@@ -66,8 +66,9 @@ class MatchSettings:
     later_scale:
         Least scale of fibers' azimuthal lobes after the first bounce, rad, in these pictures (``Tracer``): less noise,
         while the brightness stays within about 2 %.
-    learning:
-        Samples per pixel, at least, that the pictures' radiance cache learns from, see ``MatchPictures``; 0: none.
+    look_rays:
+        The same for the first looks, which are many: their paths end at a radiance cache (``MatchPictures``), which
+        makes pictures of less noise but not differences between them. 0: they cost what the others do.
     iterations:
         Rounds of finite differences.
     steps:
@@ -86,7 +87,7 @@ class MatchSettings:
     spp: int = 4
     rays: int = 0
     later_scale: float | None = None
-    learning: int = 0
+    look_rays: int = 0
     iterations: int = 2
     steps: int = 3
     levels: tuple[int, ...] = (1, 2, 4)
@@ -97,17 +98,19 @@ class MatchSettings:
 
     @property
     def pictures(self) -> int:
-        """How many pictures are rendered at most, about."""
+        """How many pictures are rendered at most, about; looks that cost less count for less."""
         systems, channels = 2, 3
         moving = [name for name in self.free if name not in OF_THE_CAMERA]
         coordinates = systems * (len(moving) + (channels - 1 if "albedo" in moving else 0))
         looks = most_looks(questions(self.shapes, rig_known=False))
+        if self.look_rays and self.rays:
+            looks = round(looks * self.look_rays / self.rays)
         return looks + self.iterations * (coordinates + self.steps * len(DAMPINGS))
 
     @property
     def samples(self) -> float:
         """Samples per pixel that cost what a picture costs, about, in cloth neither dark nor white."""
-        return self.rays / RAYS_PER_PATH if self.rays else float(self.spp)
+        return max(float(self.spp), self.rays / RAYS_PER_PATH)
 
     @property
     def shapes(self) -> bool:
@@ -125,11 +128,21 @@ SOFTER = 0.15
 """``later_scale`` of all qualities."""
 
 QUALITIES: dict[str, MatchSettings] = {
-    "draft": MatchSettings(width=192, rays=50, later_scale=SOFTER, learning=1, iterations=1, free=DRAFTED),
-    "standard": MatchSettings(rays=150, later_scale=SOFTER, learning=1),
-    "paper": MatchSettings(width=360, spp=16, rays=500, later_scale=SOFTER, learning=1, iterations=4),
+    "draft": MatchSettings(width=192, rays=100, look_rays=50, later_scale=SOFTER, iterations=1, free=DRAFTED),
+    "standard": MatchSettings(rays=200, look_rays=100, later_scale=SOFTER),
+    "paper": MatchSettings(width=360, spp=16, rays=500, look_rays=200, later_scale=SOFTER, iterations=4),
 }
 """What ``--quality`` means here."""
+
+
+@dataclass(frozen=True)
+class MatchPoint:
+    """A fabric, what its picture under ``rig`` is multiplied by to be as bright as the target, and the rig, whose blur
+    is that of the photo."""
+
+    fabric: FabricParameters
+    exposure: float
+    rig: Rig | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,9 +151,9 @@ class MatchResult:
 
     Parameters
     ----------
-    fabric, exposure, rig:
-        The best point; what its picture under the rig is multiplied by to be as bright as the target. The rig's blur is
-        that of the photo.
+    way:
+        The points that were taken, from the best look on; the last has the least loss. Its pictures are few samples,
+        denoised: seen better, an earlier one may be closer to the photo.
     losses:
         Of the start and after each step that was taken.
     uncertainty:
@@ -150,21 +163,35 @@ class MatchResult:
         Whether Ctrl-C ended it early.
     """
 
-    fabric: FabricParameters
-    exposure: float
+    way: tuple[MatchPoint, ...]
     losses: tuple[float, ...]
     uncertainty: dict[str, float]
     interrupted: bool
-    rig: Rig | None = None
+
+    @property
+    def fabric(self) -> FabricParameters:
+        """Of the last point."""
+        return self.way[-1].fabric
+
+    @property
+    def exposure(self) -> float:
+        """Of the last point."""
+        return self.way[-1].exposure
+
+    @property
+    def rig(self) -> Rig | None:
+        """Of the last point."""
+        return self.way[-1].rig
 
 
 @dataclass(eq=False)
 class _State:
-    """Where the search stands after ``round`` rounds of differences."""
+    """Where the search stands after ``round`` rounds of differences; ``way`` are the points that were taken."""
 
     round: int
     point: Floats
     losses: list[float]
+    way: list[Floats]
     answers: Answers = ()
     light: float = 1.0
     damping: int = 0
@@ -235,11 +262,7 @@ def match_photo(
 
     picture = torch.from_numpy(np.ascontiguousarray(goal, dtype=np.float32)).permute(2, 0, 1)
     target = Target.from_image(picture, net, settings.levels, settings.kind)
-    pictures = MatchPictures(
-        target, settings.width, settings.spp, settings.seed, settings.later_scale, settings.learning
-    )
-    if settings.rays:
-        pictures.spend(settings.rays, start, rig)
+    pictures = MatchPictures(target, settings.width, settings.spp, settings.seed, settings.later_scale)
     identity = fingerprint(start, np.asarray(goal, dtype=np.float32), settings, float(exposure), rig, rig_known)
     state = None
     if checkpoint is not None and checkpoint.exists():
@@ -258,9 +281,8 @@ def match_photo(
         interrupted = True
     deviations = state.deviations if state.deviations is not None else np.zeros(len(space.names))
     return MatchResult(
-        space.fabric(state.point), space.exposure(state.point), tuple(state.losses),
+        tuple(MatchPoint(space.fabric(p), space.exposure(p), search.rig_at(p)) for p in state.way), tuple(state.losses),
         {k: v for k, v in space.deviations(state.point, deviations).items() if v > 0.0}, interrupted,
-        search.rig_at(state.point),
     )  # fmt: skip
 
 
@@ -281,7 +303,7 @@ class _Search:
         free = [name for name in settings.free if not (rig_known and name == BLUR)]
         self.space = MatchSpace.about(start.fabric, free, exposure, start.rig.blur if start.rig else 0.0)
         self.scale = settings.width / start.fabric.size[0]
-        self.state = state or _State(0, np.zeros(len(self.space.names)), [])
+        self.state = state or _State(0, np.zeros(len(self.space.names)), [], [np.zeros(len(self.space.names))])
         self._progress = progress or (lambda *_: None)
         self._each = len(self.space.names) + settings.steps * len(DAMPINGS)
         self._looks = most_looks(self.questions)
@@ -295,6 +317,9 @@ class _Search:
             self._done += self._looks
             self._settle(exposure)
             return
+        if self.settings.look_rays:
+            self.pictures.learning = 1
+            self.pictures.spend(self.settings.look_rays, self.start.fabric, self.start.rig)
         looks: dict[Answers, _Look] = {}
 
         def loss_of(answers: Answers) -> float:
@@ -332,6 +357,9 @@ class _Search:
         if self.questions:
             # The best of many looks owes something to its noise, which steps would have to beat.
             self.pictures.seed = self.settings.seed + 1
+        self.pictures.learning, self.pictures.spp = 0, self.settings.spp
+        if self.settings.rays:
+            self.pictures.spend(self.settings.rays, seen.fabric, seen.rig)
         self.picture, self.residuals, self.loss = self._look(self.state.point)
 
     def rig_at(self, point: Floats) -> Rig | None:
@@ -376,6 +404,7 @@ class _Search:
 
     def _take(self, there: _Point) -> None:
         self.state.point = there.place
+        self.state.way.append(there.place)
         self.picture, self.residuals, self.loss = there.picture, there.residuals, there.loss
         self.state.losses.append(there.loss)
 
@@ -424,8 +453,8 @@ def _arrays(state: _State) -> dict[str, NDArray]:
 def _state(arrays: dict[str, NDArray]) -> _State:
     answers = tuple((question, look) for question, look in arrays["answers"].reshape(-1, 2).tolist())
     return _State(
-        int(arrays["round"]), arrays["point"], arrays["losses"].tolist(), answers, float(arrays["light"]),
-        int(arrays["damping"]), arrays["deviations"],
+        int(arrays["round"]), arrays["point"], arrays["losses"].tolist(), list(arrays["way"]), answers,
+        float(arrays["light"]), int(arrays["damping"]), arrays["deviations"],
     )  # fmt: skip
 
 

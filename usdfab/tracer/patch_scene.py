@@ -154,10 +154,11 @@ def build_patch_scene(fabric: FabricParameters, patch: Patch | None = None) -> P
     systems: list[int] = []
     albedo: list[tuple[float, ...]] = []
     base = 0
-    for system in patch.curves:
+    with ThreadPoolExecutor(len(patch.curves)) as pool:
+        pieces = list(pool.map(partial(_tile_segments, size=patch.size), patch.curves))
+    for system, (v, t, f, g, curve) in zip(patch.curves, pieces, strict=True):
         yarn = fabric.system(system.system)
         colors, color_of_curve = np.unique(system.albedo, axis=0, return_inverse=True)
-        v, t, f, g, curve = _tile_segments(system, patch.size)
         vertices.append(units * np.c_[v, np.full(len(v), system.radius)])
         tangents.append(pack_tangents(t))
         segments.append(np.c_[f + base, curve + sum(len(c) for c in curves)])
