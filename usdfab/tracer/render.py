@@ -124,7 +124,7 @@ class Tracer:
         textures: Mapping[str, NDArray] | None = None,
         strict: bool = False,
         later_scale: float | None = None,
-        build: Callable[[FabricParameters], list[PatchScene]] = build_tiles,
+        build: Callable[[FabricParameters], list[PatchScene]] | None = None,
     ) -> None:
         """Build tiles, meshes, materials and lights.
 
@@ -138,7 +138,7 @@ class Tracer:
             Least scale, rad, of the azimuthal lobes of fibers at all bounces but the first (``soften_fiber``): a
             fraction of the noise, and what light does deep in the cloth is a little blurred. None: as they are.
         build:
-            What makes the tiles of a fabric.
+            What makes the tiles of a fabric; ``build_tiles`` by default.
         """
         glow = any(np.any(m.emissive) or "emissiveColor" in m.textures for m in scene.materials if m.fabric < 0)
         if not scene.lights and not glow:
@@ -151,7 +151,7 @@ class Tracer:
         for surface in scene.fabrics:
             if surface.fabric not in fabrics:
                 fabrics.append(surface.fabric)
-                built = build(surface.fabric)
+                built = (build or build_tiles)(surface.fabric)
                 tiles_of[len(fabrics) - 1] = Tiles(len(self._tiles), len(built))
                 self._tiles += built
                 owners += [surface.fabric] * len(built)
