@@ -146,16 +146,15 @@ def best_answers(asked: tuple[tuple[Look, ...], ...], loss_of: Callable[[Answers
     first = losses[branches[0]]
     # Equal losses are the same cloth: it was closed before.
     near = [branch for branch in branches[1:] if first < losses[branch] <= NEARLY * first]
-    return min((_climb(asked, branch, losses[branch], loss_of) for branch in [branches[0], *near[:1]]), key=_LOSS)[1]
+    return min(
+        (_climb(asked, branch, losses[branch], loss_of) for branch in [branches[0], *near[:1]]), key=itemgetter(0)
+    )[1]
 
 
 def most_looks(asked: tuple[tuple[Look, ...], ...]) -> int:
     """How many looks ``best_answers`` takes at most, about."""
     first, *others = asked or ((),)
     return 1 + len(first) + round((1.0 + LOOKS_AGAIN) * sum(map(len, others)))
-
-
-_LOSS = itemgetter(0)
 
 
 def _climb(

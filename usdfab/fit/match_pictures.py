@@ -96,7 +96,7 @@ class MatchPictures:
     def picture(self, fabric: FabricParameters, rig: Rig | None) -> Singles:
         """(H, W, 3) linear, denoised, at exposure 1, without the rig's blur."""
         sharp = replace(rig, blur=0.0) if rig else None
-        key = fingerprint(fabric, sharp, self.seed)
+        key = fingerprint(fabric, sharp, self.seed, self.spp, self.learning)
         if key not in self._kept:
             self._kept[key] = self._rendered(fabric, sharp)
             while len(self._kept) > KEPT:

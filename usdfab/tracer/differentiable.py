@@ -28,7 +28,7 @@ from usdfab.tracer.film import CHANNELS, RGB
 from usdfab.tracer.gradient_kernel import gradient_tile
 from usdfab.tracer.kernel import render_tile
 from usdfab.tracer.patch_scene import PatchScene, fiber_parameters, pack_material
-from usdfab.tracer.render import RenderSettings, Tracer, pack_view, thread_count
+from usdfab.tracer.render import RenderSettings, Shot, Tracer, thread_count
 from usdfab.tracer.schedule import Window, plan_tiles
 from usdfab.tracer.tape import SHARED, tape_size
 from usdfab.tracer.world import World
@@ -100,9 +100,7 @@ class DifferentiableTracer:
         self._camera = camera
         self._tracer = Tracer(scene)
         self.warnings = self._tracer.warnings
-        close = camera.to_world_close
-        moves = self._tracer._moves or (close is not None and not np.array_equal(close, camera.to_world))
-        self._view = pack_view(camera, *size, moves)
+        self._view = self._tracer.view(Shot(camera, *size, seed=0, max_depth=max_depth))
         self._gain = 2.0**camera.exposure
         self._owners = np.concatenate([self._owners_of(*tile) for tile in self._tracer.tiles])
 
