@@ -60,6 +60,8 @@ FORWARD: dict[str, tuple[Any, str]] = {
     "meeting": (raster, "meet"),
     "shadow edges": (raster, "shadow_edges"),
     "edges": (raster, "visible_edges"),
+    "rims": (raster, "rims_at_ends"),
+    "light beyond": (raster, "light_beyond"),
     "shading": (raster, "shaded"),
     "blending": (raster, "blended"),
 }
@@ -173,7 +175,7 @@ def peers(fabric: FabricParameters, width: int, runs: int) -> dict[str, Any]:
     def gradient(name: str, reference: bool) -> None:
         vector = parameters.vector().requires_grad_(True)
         shapes, look = parameters.of(parameters.natural(vector))
-        image = Reference(pixels, pixels.model(shapes)).image(look) if reference else pixels.image(shapes, look)
+        image = Reference(pixels, look).image(shapes) if reference else pixels.image(shapes, look)
         (image * weights).sum().backward()
         gradients[name] = vector.grad
 

@@ -253,7 +253,7 @@ def render_size(fabric: FabricParameters, width: int) -> tuple[int, int]:
 def _renderer(fabric: FabricParameters, settings: StageSettings, rig: Rig | None = None) -> RasterRenderer:
     size = render_size(fabric, settings.width)
     raster = RasterSettings(
-        size, settings.supersampling, single=settings.single, diffuse=settings.diffuse,
+        size, settings.supersampling, single=settings.single, diffuse=settings.diffuse, rims=settings.steps == "adam",
         unshadowed=UNSHADOWED if _diffuse_is_tied(settings) else 0.0,
     )  # fmt: skip
     return raster_renderer(sample_scene(fabric, rig), raster)

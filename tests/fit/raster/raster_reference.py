@@ -2,16 +2,23 @@
 
 import itertools
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from pytest import MonkeyPatch
 from torch import Tensor
 
+from usdfab.fit.raster import jumps, renderer as renderer_module, rims
 from usdfab.fit.raster.curves import CurveModel, Polylines
-from usdfab.fit.raster.edges import Pairs
+from usdfab.fit.raster.edges import Jumps, Pairs, inside, outside
+from usdfab.fit.raster.hits import SIDE, Meeting
+from usdfab.fit.raster.jumps import ALONG_ROW, ANY, GAP_P, GAP_Q, P_ENDS, Q_ENDS
 from usdfab.fit.raster.renderer import RasterRenderer
-from usdfab.fit.raster.visibility import NOTHING, Seen, index_patch, look
+from usdfab.fit.raster.segments import Geometry
+from usdfab.fit.raster.shade import Look
+from usdfab.fit.raster.visibility import NOTHING, Seen, taken
 from usdfab.scattering.fiber_torch import eval_fiber, pack_fiber
 
 STEPS, EPSILON = 2, 1e-12
@@ -60,11 +67,12 @@ def pass_by(s: Segments, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     )
 
 
-def meet(s: Segments, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Distance, tangent and h."""
+def meet(s: Segments, direction: Tensor, side: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
+    """Distance, tangent and h; the distance's root without slope where it is less than ``side``."""
     h, middle, half = pass_by(s, direction)
     h = h.clamp(-1.0, 1.0)
-    distance = middle - half * torch.sqrt((1.0 - h * h).clamp_min(0.0) + EPSILON)
+    root = torch.sqrt((1.0 - h * h).clamp_min(0.0) + EPSILON)
+    distance = middle - half * torch.where(root > side, root, root.detach())
     chord = s.end - s.start
     hit = distance[:, None] * direction
     u = (dot(hit - s.start, chord) / (dot(chord, chord) + EPSILON)).clamp(0.0, 1.0)[:, None]
@@ -78,50 +86,87 @@ def meet(s: Segments, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class Reference:
-    """The picture of a ``RasterRenderer``, once more. Lengths in units of ``scale``."""
+    """What the kernels of a ``RasterRenderer`` do, once more, for a ``Look``. Lengths in units of the geometry."""
 
-    def __init__(self, renderer: RasterRenderer, lines: Polylines) -> None:
-        self.renderer, self.lines = renderer, lines
+    def __init__(self, renderer: RasterRenderer, look: Look) -> None:
+        self.renderer, self.look = renderer, look
         self.model: CurveModel = renderer.model
-        self.geometry = renderer._geometry
-        self.scale = self.geometry.scale
-        self.directions = torch.from_numpy(self.geometry.direction)
-        index = index_patch(self.model, lines.points.detach().numpy(), lines.radius.detach().numpy())
-        view = renderer._view
-        self.lamps = view.lamps if renderer.settings.shadows else view.lamps[:0]
-        self.seen, self.shadows = look(index, view.eye, self.geometry.direction, self.lamps)
 
-    def segments(self, segment: np.ndarray, copy: np.ndarray, start: np.ndarray) -> Segments:
-        model, lines, size = self.model, self.lines, np.array(self.model.size)
+    def instead_of_kernels(self, monkeypatch: MonkeyPatch) -> None:
+        for module in (renderer_module, rims):
+            monkeypatch.setattr(module, "shadow_edges", self.shadow_edges)
+        monkeypatch.setattr(renderer_module, "meet", self.meet)
+        monkeypatch.setattr(rims, "sides", lambda *a: self.meet(*a, side=SIDE).distance)
+        monkeypatch.setattr(renderer_module, "shaded", self.shaded)
+        monkeypatch.setattr(renderer_module, "blended", blended)
+        monkeypatch.setattr(jumps, "_crossings", self.crossings)
+        monkeypatch.setattr(jumps, "_kinds_of", lambda geometry, points, radius, *rest: self.kinds_of(geometry, *rest))
+
+    def segments(self, geometry: Geometry, lines: Polylines, segment: np.ndarray, copy: np.ndarray, start: np.ndarray):
+        """Relative to ``start`` (M, 3)."""
+        model, size = self.model, geometry.size
         pad = np.zeros((len(segment), 1))
         shift = np.c_[copy * size, pad] - start
         on = shift + np.c_[model.following_shift[segment] * size, pad]
         first, second = torch.from_numpy(segment), torch.from_numpy(model.following[segment])
-        radius = lines.radius / self.scale
         return Segments(
-            (lines.points[first] + torch.from_numpy(shift)) / self.scale,
-            (lines.points[second] + torch.from_numpy(on)) / self.scale,
+            lines.points[first] / geometry.scale + torch.from_numpy(shift),
+            lines.points[second] / geometry.scale + torch.from_numpy(on),
             lines.tangents[first],
             lines.tangents[second],
-            radius[torch.from_numpy(model.system[segment])],
+            (lines.radius / geometry.scale)[torch.from_numpy(model.system[segment])],
         )
 
-    def beside(self, seen: Seen, rows: np.ndarray, start: np.ndarray, direction: Tensor) -> Segments:
-        segment, copy = seen.segment[rows].astype(np.int64), seen.copy[rows].astype(np.int64)
-        model = self.model
+    def settled(self, geometry: Geometry, lines: Polylines, seen: Seen, start: np.ndarray, direction: Tensor):
+        """Segments and copies beside rays (M, 3) of the fibers that were seen."""
+        model, segment, copy = self.model, seen.segment.astype(np.int64), seen.copy.astype(np.int64)
         for _ in range(STEPS):
-            along = _cylinder(self.segments(segment, copy, start), direction.detach())[3].detach().numpy()
+            along = _cylinder(self.segments(geometry, lines, segment, copy, start), direction)[3].detach().numpy()
             on, back = along > 1.0, along < 0.0
             copy = copy + on[:, None] * model.following_shift[segment]
             copy = copy + back[:, None] * model.preceding_shift[segment]
             segment = np.where(on, model.following[segment], np.where(back, model.preceding[segment], segment))
-        return self.segments(segment, copy, start)
+        return segment, copy
 
-    def starts(self, at: np.ndarray) -> np.ndarray:
-        return self.geometry.start[at] * self.scale
+    def passing(self, geometry: Geometry, lines: Polylines, seen: Seen, at: np.ndarray):
+        """What ``pass_by`` finds for fibers and the rays of pixels ``at``, with the segments and copies."""
+        start, direction = geometry.start[at], torch.from_numpy(geometry.direction[at])
+        found = self.settled(geometry, lines, seen, start, direction)
+        return *pass_by(self.segments(geometry, lines, *found, start), direction), *found
 
-    def jumps(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        model, seen = self.model, self.seen
+    def meet(self, geometry: Geometry, lines: Polylines, seen: Seen, side: float = 0.0) -> Meeting:
+        n, hit = len(geometry.start), np.flatnonzero(seen.segment != NOTHING)
+        s = self.segments(geometry, lines, seen.segment[hit].astype(np.int64), seen.copy[hit], geometry.start[hit])
+        rows = torch.from_numpy(hit)
+        found = meet(s, torch.from_numpy(geometry.direction)[rows], side)
+        shapes = ((n,), (n, 3), (n,))
+        return Meeting(
+            *(torch.zeros(f, dtype=torch.float64).index_copy(0, rows, x) for f, x in zip(shapes, found, strict=True))
+        )
+
+    def depth(self, h: Tensor, axis: Tensor, unit: Tensor) -> Tensor:
+        return axis - unit * torch.sqrt((1.0 - h * h).clamp_min(1e-9))
+
+    def profile(self, geometry: Geometry, lines: Polylines, seen: Seen, at: np.ndarray):
+        """h, depth of the axis and radius along the rays of pixels ``at``, with the segments and copies."""
+        h, middle, half, *found = self.passing(geometry, lines, seen, at)
+        down = -torch.from_numpy(geometry.direction[at, 2])
+        return h, middle * down, half * down, *found
+
+    def showing(self, geometry: Geometry, lines: Polylines, ends: Seen, other: Seen, at: np.ndarray):
+        """The jump function of ``ends`` before ``other``, with the segments and copies of both."""
+        h, axis, unit, *found = self.profile(geometry, lines, ends, at)
+        solid = np.flatnonzero(other.segment != NOTHING)
+        rows = torch.from_numpy(solid)
+        *there, segment, copy = self.profile(geometry, lines, taken(other, solid), at[solid])
+        sunk = ((axis[rows] - self.depth(*there)) / unit[rows]).clamp_min(0.0)
+        sunk = torch.zeros_like(h).index_copy(0, rows, sunk)
+        segments, copies = np.full(len(h), NOTHING), np.zeros((len(h), 2), dtype=np.int64)
+        segments[solid], copies[solid] = segment, copy
+        return torch.sqrt(h * h + sunk * sunk + 1e-12) - 1.0, *found, segments, copies
+
+    def differ(self, seen: Seen, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        model = self.model
         a, b = seen.segment[p].astype(np.int64), seen.segment[q].astype(np.int64)
         copy_a, copy_b = seen.copy[p], seen.copy[q]
         same_copy = (copy_a == copy_b).all(axis=1)
@@ -129,123 +174,125 @@ class Reference:
         for one, other, of_one, of_other in ((a, b, copy_a, copy_b), (b, a, copy_b, copy_a)):
             next_copy = of_one + model.following_shift[one]
             same |= (one >= 0) & (model.following[one] == other) & (next_copy == of_other).all(axis=1)
-        return ~same
+        return ~same & ((a >= 0) | (b >= 0))
 
-    def profile(self, of: np.ndarray, at: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
-        direction = self.directions[torch.from_numpy(at)]
-        h, middle, half = pass_by(self.beside(self.seen, of, self.starts(at), direction), direction)
-        return h, -middle * direction[:, 2], -half * direction[:, 2]
+    def kinds_of(self, geometry: Geometry, seen: Seen, pairs: Pairs, axis: int) -> np.ndarray:
+        lines = self.lines
 
-    def depth(self, of: np.ndarray, at: np.ndarray) -> Tensor:
-        h, axis, unit = self.profile(of, at)
-        return axis - unit * torch.sqrt((1.0 - h * h).clamp_min(1e-9))
+        def counts(values: list[np.ndarray]) -> np.ndarray:
+            row, column = abs(values[1] - values[0]), abs(values[2] - values[0])
+            return np.full(len(row), True) if axis == ANY else row >= column if axis == ALONG_ROW else row > column
 
-    def showing(self, ends: np.ndarray, other: np.ndarray, at: np.ndarray) -> Tensor:
-        h, axis, unit = self.profile(ends, at)
-        solid = np.flatnonzero(self.seen.segment[other] != NOTHING)
-        rows = torch.from_numpy(solid)
-        sunk = ((axis[rows] - self.depth(other[solid], at[solid])) / unit[rows]).clamp_min(0.0)
-        sunk = torch.zeros_like(h).index_copy(0, rows, sunk)
-        return torch.sqrt(h * h + sunk * sunk + 1e-12) - 1.0
-
-    def classified(self, pairs: Pairs, along_row: bool) -> np.ndarray:
-        """(M,) 0 for none, 1 where what p sees ends, 2 where what q sees does."""
         kinds = np.zeros(len(pairs.p), dtype=np.int8)
-        rows = np.flatnonzero(self.jumps(pairs.p, pairs.q))
+        rows = np.flatnonzero(self.differ(seen, pairs.p, pairs.q))
         pairs = pairs[rows]
-        nothing_p, nothing_q = (self.seen.segment[k] == NOTHING for k in (pairs.p, pairs.q))
-        of_a, of_b = np.where(nothing_p, pairs.q, pairs.p), np.where(nothing_q, pairs.p, pairs.q)
+        nothing_p, nothing_q = (seen.segment[k] == NOTHING for k in (pairs.p, pairs.q))
+        a = taken(seen, np.where(nothing_p, pairs.q, pairs.p))
+        b = taken(seen, np.where(nothing_q, pairs.p, pairs.q))
         with torch.no_grad():
-            out_a, out_b = (self.profile(of, at)[0].abs().numpy() for of, at in ((of_a, pairs.q), (of_b, pairs.p)))
-            depth_a, depth_b = (self.depth(of, of).numpy() for of in (of_a, of_b))
-            a_ends = np.where((out_a > 1.0) & (out_b > 1.0), depth_a <= depth_b, out_a > out_b)
+            places = (pairs.p, pairs.q, pairs.r)
+            h_a, h_b = ([self.profile(geometry, lines, s, at)[0] for at in places] for s in (a, b))
+            out_a, out_b = (abs(h.numpy()) for h in (h_a[1], h_b[0]))
+            apart = (out_a > 1.0) & (out_b > 1.0) & ~nothing_p & ~nothing_q
+            end_a, end_b = (crossing(h[0].abs() - 1.0, h[1].abs() - 1.0).numpy() for h in (h_a, h_b))
+            gap = apart & (end_a < end_b)
+            depth_a, depth_b = (
+                self.depth(*self.profile(geometry, lines, s, at)[:3]).numpy() for s, at in ((a, pairs.p), (b, pairs.q))
+            )
+            a_ends = np.where(apart, depth_a <= depth_b, out_a > out_b)
             a_ends = nothing_q | ~nothing_p & a_ends
-            ends, other = np.where(a_ends, pairs.p, pairs.q), np.where(a_ends, pairs.q, pairs.p)
-            at_p, at_q, at_r = (self.showing(ends, other, at).numpy() for at in (pairs.p, pairs.q, pairs.r))
-        row, column = abs(at_q - at_p), abs(at_r - at_p)
-        kinds[rows] = np.where(row >= column if along_row else row > column, np.where(a_ends, 1, 2), 0)
+            ends, other = (
+                taken(seen, np.where(a_ends, *of)) for of in ((pairs.p, pairs.q), (pairs.q, pairs.p))
+            )  # fmt: skip
+            shown = [self.showing(geometry, lines, ends, other, at)[0].numpy() for at in places]
+        plain = np.where(counts(shown), np.where(a_ends, P_ENDS, Q_ENDS), 0)
+        wide = sum(
+            np.where(counts([h.abs().numpy() for h in each]), bit, 0) for each, bit in ((h_a, GAP_P), (h_b, GAP_Q))
+        )
+        kinds[rows] = np.where(gap, wide, plain)
         return kinds
 
-    def visible_edges(self, pairs: Pairs, along_row: bool) -> tuple[Pairs, Tensor, np.ndarray, np.ndarray]:
-        kinds = self.classified(pairs, along_row)
-        pairs, kinds = pairs[kinds > 0], kinds[kinds > 0]
-        ends, other = np.where(kinds == 1, pairs.p, pairs.q), np.where(kinds == 1, pairs.q, pairs.p)
-        t = crossing(*(self.showing(ends, other, at) for at in (pairs.p, pairs.q)))
-        smooth = []
-        for near, far in ((pairs.p, pairs.before), (pairs.q, pairs.after)):
-            alike = (near != far) & ~self.jumps(near, far)
-            for shadow in self.shadows:
-                alike &= (shadow.segment[near] != NOTHING) == (shadow.segment[far] != NOTHING)
-            smooth.append(alike)
-        return pairs, t, smooth[0], smooth[1]
+    def crossings(self, geometry: Geometry, lines: Polylines, seen: Seen, pairs: Pairs, kinds: np.ndarray, alone: bool):
+        ends = taken(seen, np.where(kinds == P_ENDS, pairs.p, pairs.q))
+        other = taken(seen, np.where(kinds == P_ENDS, pairs.q, pairs.p))
+        if alone:
+            other = replace(other, segment=np.full(len(kinds), NOTHING))
+        first, second = (self.showing(geometry, lines, ends, other, at) for at in (pairs.p, pairs.q))
+        segments = np.stack([first[1], second[1], first[3], second[3]])
+        copies = np.stack([first[2], second[2], first[4], second[4]])
+        return crossing(first[0], second[0]), (segments, copies)
 
-    def shadow_edges(self, shadow: Seen, distance: Tensor, lamp: np.ndarray, pairs: Pairs, along_row: bool):
-        dark, seen = shadow.segment != NOTHING, self.seen.segment != NOTHING
-        pairs = pairs[(dark[pairs.p] != dark[pairs.q]) & seen[pairs.p] & ~self.jumps(pairs.p, pairs.q)]
+    def shadow_edges(
+        self, geometry: Geometry, lines: Polylines, distance: Tensor, shines: Tensor, seen: Seen, shadow: Seen, lamp,
+        pairs: Pairs, along_row: bool, reach=None,
+    ):  # fmt: skip
+        dark = shadow.segment != NOTHING
+        reach = np.ones(len(pairs.p)) if reach is None else reach
+        chosen = (dark[pairs.p] != dark[pairs.q]) & (seen.segment[pairs.p] != NOTHING)
+        chosen &= ~self.differ(seen, pairs.p, pairs.q)
+        pairs, reach = pairs[chosen], torch.from_numpy(reach[chosen])
         owner, lit = np.where(dark[pairs.p], pairs.p, pairs.q), np.where(dark[pairs.p], pairs.q, pairs.p)
 
-        def cast(at: np.ndarray) -> Tensor:
-            rows = torch.from_numpy(at)
-            place = distance[rows, None] * self.directions[rows]
-            to_lamp = torch.from_numpy((lamp - self.starts(at)) / self.scale) - place
+        def cast(at: np.ndarray, far: Tensor, caster: np.ndarray) -> Tensor:
+            place = far[:, None] * torch.from_numpy(geometry.direction[at])
+            to_lamp = torch.from_numpy(lamp / geometry.scale - geometry.start[at]) - place
             to_lamp = to_lamp / torch.linalg.norm(to_lamp, dim=-1, keepdim=True)
-            origin = self.starts(at) + self.scale * place.detach().numpy()
-            s = self.beside(shadow, owner, origin, to_lamp)
+            origin = geometry.start[at] + place.detach().numpy()
+            found = self.settled(geometry, lines, taken(shadow, caster), origin, to_lamp.detach())
+            s = self.segments(geometry, lines, *found, origin)
             rest = place - place.detach()
             return pass_by(s._replace(start=s.start - rest, end=s.end - rest), to_lamp)[0]
 
-        same = ~self.jumps(pairs.p, pairs.r) & seen[pairs.r]
         with torch.no_grad():
-            here = cast(pairs.p)
-            row, column = (cast(pairs.q) - here).abs(), (cast(np.where(same, pairs.r, pairs.p)) - here).abs()
-            keep = (row >= column if along_row else row > column).numpy() & (same | along_row)
-            sign = torch.sign(cast(lit))[torch.from_numpy(keep)]
+            h, middle, half, _, _ = self.passing(geometry, lines, taken(seen, pairs.p), pairs.r)
+            aside = middle - half * torch.sqrt((1.0 - h * h).clamp_min(0.0) + EPSILON)
+            here, there, beyond = (
+                cast(at, distance[torch.from_numpy(at)], owner) for at in (pairs.p, pairs.q, lit)
+            )  # fmt: skip
+            row, column = (there - here).abs() / reach, (cast(pairs.r, aside, owner) - here).abs()
+            keep = (row >= column if along_row else row > column).numpy()
+            sign = torch.sign(beyond)[torch.from_numpy(keep)]
         pairs, owner = pairs[keep], owner[keep]
-        flat = np.zeros(len(pairs.p), dtype=bool)
-        return pairs, crossing(sign * cast(pairs.p) - 1.0, sign * cast(pairs.q) - 1.0), flat, flat
+        at_p, at_q = (sign * cast(at, distance[torch.from_numpy(at)], owner) - 1.0 for at in (pairs.p, pairs.q))
+        t = crossing(at_p, at_q)
+        step = shines[torch.from_numpy(outside(pairs, t))] - shines[torch.from_numpy(inside(pairs, t))]
+        return [Jumps(pairs, t, step)]
 
-    def image(self, look_) -> Tensor:
-        """(H, W, 3)"""
-        renderer, settings = self.renderer, self.renderer.settings
-        view, n = renderer._view, len(self.directions)
-        hit = np.flatnonzero(self.seen.segment != NOTHING)
-        rows = torch.from_numpy(hit)
-        segment = self.seen.segment[hit].astype(np.int64)
-        s = self.segments(segment, self.seen.copy[hit], self.starts(hit))
-        distance, tangent, h = meet(s, self.directions[rows])
-        far = torch.zeros(n, dtype=torch.float64).index_copy(0, rows, distance)
-        spread = renderer._pixel / s.radius
-        flat = torch.zeros(n, 3, dtype=torch.float64)
+    def shaded(self, geometry: Geometry, seen: Seen, met: Meeting, lit: Tensor, *_) -> Tensor:
+        """(N, 3) of all lamps."""
+        view, settings, hit = self.renderer._view, self.renderer.settings, np.flatnonzero(seen.segment != NOTHING)
+        rows, segment = torch.from_numpy(hit), seen.segment[hit].astype(np.int64)
+        direction, distance, lit = torch.from_numpy(geometry.direction[hit]), met.distance[rows], lit[rows]
+        spread = self.renderer._pixel * geometry.scale / self.lines.radius[torch.from_numpy(self.model.system[segment])]
+        total = torch.zeros(len(hit), 3, dtype=torch.float64)
         for k, lamp in enumerate(view.lamps):
-            lit = torch.ones(len(hit), dtype=torch.float64)
-            if settings.shadows:
-                shines = torch.from_numpy((self.shadows[k].segment == NOTHING).astype(float))[:, None]
-                if settings.edges:
-                    parts = [
-                        self.shadow_edges(self.shadows[k], far, lamp, pairs, along_row)
-                        for pairs, along_row in zip(renderer._pairs, (True, False), strict=True)
-                    ]
-                    shines = blended(shines, parts)
-                lit = shines[rows, 0]
-            to_lamp = (
-                torch.from_numpy((lamp - self.starts(hit)) / self.scale) - distance[:, None] * self.directions[rows]
-            )
-            intensity = torch.from_numpy(view.intensity[k] / self.scale**2)
+            to_lamp = torch.from_numpy(lamp / geometry.scale - geometry.start[hit]) - distance[:, None] * direction
             rest = settings.unshadowed
-            for part, shines in (("single", lit), ("diffuse", rest + (1.0 - rest) * lit)):
+            for part, shines in (("single", lit[:, k]), ("diffuse", rest + (1.0 - rest) * lit[:, k])):
                 if getattr(settings, part):
-                    light = self._shaded(part, look_, segment, tangent, h, self.directions[rows], spread, to_lamp)
-                    flat = flat.index_add(0, rows, light * shines[:, None] * intensity)
-        if settings.edges:
-            parts = [self.visible_edges(pairs, row) for pairs, row in zip(renderer._pairs, (True, False), strict=True)]
-            flat = blended(flat, parts)
-        height, width = renderer._shape
-        m = settings.supersampling
-        return view.gain * look_.gain * flat.reshape(height // m, m, width // m, m, 3).mean(dim=(1, 3))
+                    light = self._shaded(part, segment, met.tangent[rows], met.h[rows], direction, spread, to_lamp)
+                    intensity = torch.from_numpy(view.intensity[k] / geometry.scale**2)
+                    total = total + light * shines[:, None] * intensity
+        return torch.zeros(len(seen.segment), 3, dtype=torch.float64).index_add(0, rows, total)
 
-    def _shaded(self, part: str, look_, segment, tangent, h, ray, spread, offset) -> Tensor:
+    @property
+    def lines(self) -> Polylines:
+        """Those of the picture that is being made."""
+        return self._lines
+
+    def image(self, shapes) -> Tensor:
+        """(H, W, 3) of the renderer, without kernels."""
+        self._lines = self.model(shapes)
+        with MonkeyPatch.context() as patch:
+            self.instead_of_kernels(patch)
+            pixels = self.renderer.pixels(self._lines, self.look)
+        height, width = self.renderer._shape
+        m = self.renderer.settings.supersampling
+        return pixels.reshape(height // m, m, width // m, m, 3).mean(dim=(1, 3))
+
+    def _shaded(self, part: str, segment, tangent, h, ray, spread, offset) -> Tensor:
         """Single scattering or diffuse light of pieces of equal angle, over the squared distance."""
-        fabric = self.renderer.fabric
+        fabric, look_ = self.renderer.fabric, self.look
         squared = dot(offset, offset)
         to_lamp = offset / torch.sqrt(squared)[:, None]
         total = torch.zeros(len(h), 3, dtype=torch.float64)
@@ -299,14 +346,7 @@ def crossing(at_p: Tensor, at_q: Tensor) -> Tensor:
 
 def blended(values: Tensor, parts) -> Tensor:
     result = values
-    for pairs, t, smooth_p, smooth_q in parts:
-        p, q = torch.from_numpy(pairs.p), torch.from_numpy(pairs.q)
-        slope_p = torch.from_numpy(smooth_p)[:, None] * (values[p] - values[torch.from_numpy(pairs.before)])
-        slope_q = torch.from_numpy(smooth_q)[:, None] * (values[torch.from_numpy(pairs.after)] - values[q])
-        slope_p, slope_q = torch.maximum(slope_p, -values[p]), torch.minimum(slope_q, values[q])
-        width = (0.5 - t)[:, None]
-        at_p = values[q] - slope_q - values[p]
-        moved = width * (at_p + (slope_q - slope_p) * (0.5 * (t + 0.5))[:, None])
-        towards_p = (width > 0.0) * moved
-        result = result.index_add(0, p, towards_p).index_add(0, q, moved - towards_p)
+    for part in parts:
+        target = torch.where(part.t < 0.5, torch.from_numpy(part.pairs.p), torch.from_numpy(part.pairs.q))
+        result = result.index_add(0, target, (0.5 - part.t).abs()[:, None] * part.step)
     return result

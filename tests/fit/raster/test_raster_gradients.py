@@ -79,20 +79,9 @@ def test_without_edges_the_gradient_is_wrong():
     ("shadows", "part", "points"),
     [
         (False, 0.02, 7),
-        # Rims of shadows jump together over some pixels: over .02 the differences vary by 15 % from one resolution to
-        # the next, far more than the fit's error tells.
         (True, 0.06, 13),
-        pytest.param(
-            True, 0.02, 7,
-            marks=pytest.mark.xfail(reason="the warp's inclination is 16 % off these short differences", strict=True),
-        ),
-        pytest.param(
-            False, 0.06, 13,
-            marks=pytest.mark.xfail(
-                reason="the weft's radius is 20 %, its flattening 14 % off: single scattering at silhouettes",
-                strict=True,
-            ),
-        ),
+        (True, 0.02, 7),
+        (False, 0.06, 13),
     ],
 )  # fmt: skip
 def test_gradients_of_everything(shadows, part, points):

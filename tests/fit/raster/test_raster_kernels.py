@@ -8,7 +8,8 @@ from raster_reference import Reference
 from raster_scenes import coarse_fabric, coarse_renderer, leaves
 
 from usdfab.fit.raster.hits import in_units
-from usdfab.fit.raster.jumps import P_ENDS, Q_ENDS, classified
+from usdfab.fit.raster.jumps import ALONG_COLUMN, ALONG_ROW, GAP_P, GAP_Q, P_ENDS, Q_ENDS, classified
+from usdfab.fit.raster.visibility import index_patch, look
 
 TILTED = coarse_fabric(fiber_count=20, roughness_azimuthal=0.15, cuticle_tilt=0.05)
 SETTINGS = {
@@ -19,6 +20,7 @@ SETTINGS = {
     "no diffuse": {"pixels": 12, "diffuse": False},
     "no edges": {"pixels": 12, "edges": False},
     "no shadows": {"pixels": 16, "shadows": False},
+    "no rims": {"pixels": 12, "rims": False},
 }
 """``small`` has pixels wider than fibers."""
 
@@ -31,8 +33,7 @@ def test_picture_and_gradients_are_those_of_autograd(name):
     pictures, gradients = [], []
     for reference in (False, True):
         shapes, look, named = leaves(renderer)
-        lines = renderer.model(shapes)
-        image = Reference(renderer, lines).image(look) if reference else renderer.image(shapes, look)
+        image = Reference(renderer, look).image(shapes) if reference else renderer.image(shapes, look)
         (weights * image).sum().backward()
         pictures.append(image.detach().numpy())
         gradients.append({k: torch.zeros_like(v) if v.grad is None else v.grad for k, v in named.items()})
@@ -47,13 +48,17 @@ def test_picture_and_gradients_are_those_of_autograd(name):
 @pytest.mark.parametrize("name", ["all", "tilted", "small"])
 def test_jumps_are_classified_as_in_torch(name):
     renderer = coarse_renderer(**SETTINGS[name] | {"pixels": 32})
-    lines = renderer.model(renderer.model.shapes())
-    reference = Reference(renderer, lines)
-    points, radius = in_units(renderer._geometry, lines.points, lines.radius)
+    reference = Reference(renderer, renderer.look_of())
+    lines = reference._lines = renderer.model(renderer.model.shapes())
+    geometry = renderer._geometry
+    points, radius = in_units(geometry, lines.points, lines.radius)
+    index = index_patch(renderer.model, lines.points.numpy(), lines.radius.numpy())
+    seen, _ = look(index, renderer._view.eye, geometry.direction, np.zeros((0, 3)))
     for pairs, along_row in zip(renderer._pairs, (True, False), strict=True):
-        kinds = classified(renderer._geometry, points, radius, reference.seen, pairs, along_row)
-        expected = reference.classified(pairs, along_row)
+        kinds = classified(geometry, points, radius, seen, pairs, along_row)
+        expected = reference.kinds_of(geometry, seen, pairs, ALONG_ROW if along_row else ALONG_COLUMN)
         assert {P_ENDS, Q_ENDS} <= set(kinds.tolist())
+        assert name != "small" or all((kinds & bit).any() for bit in (GAP_P, GAP_Q))
         # Where two numbers are equal but for rounding, either may be the larger.
         assert (kinds != expected).sum() <= 1e-3 * (expected != 0).sum()
 

@@ -14,7 +14,7 @@ from raster_scenes import coarse_fabric
 from usdfab.errors import UsdfabError
 from usdfab.fibers import generate_patch
 from usdfab.fit.raster.curves import CurveModel
-from usdfab.fit.raster.edges import Jumps, blended, pixel_pairs
+from usdfab.fit.raster.edges import Jumps, blended, inside, outside, pixel_pairs
 from usdfab.fit.raster.view import view_of
 from usdfab.fit.raster.visibility import NOTHING, index_patch, look
 from usdfab.usd.rig import Rig, swatch_scene
@@ -80,23 +80,31 @@ def test_two_segments_agree_at_their_joint(turn, aside, along, length):
             assert float(places[0]) == pytest.approx(float(places[1]))
 
 
-@settings(max_examples=100, deadline=None)
-@given(st.floats(0.6, 6.4), *[st.floats(-0.05, 0.05)] * 2, st.floats(0.5, 1.0), st.floats(0.5, 1.0))
-def test_a_row_with_one_jump_has_the_right_area(place, slope_left, slope_right, left, right):
-    # Two straight functions that meet at ``place``: each pixel becomes its mean over its width, so sums are integrals.
+def row_with_a_jump(place, left, right):
+    """Two functions that meet at ``place``, seen by eight pixels: their blended values."""
     x = np.arange(8) + 0.5
-    values = np.where(x < place, left + slope_left * x, right + slope_right * x)
-    row = torch.from_numpy(np.vstack([values, values]).reshape(-1, 1))
+    row = torch.from_numpy(np.tile(np.where(x < place, left(x), right(x)), 2)[:, None])
     pairs = pixel_pairs(2, 8)[0]
-    jump = (x[pairs.p % 8] < place) & (x[pairs.q % 8] >= place)
-    chosen = pairs[jump]
+    chosen = pairs[(x[pairs.p % 8] < place) & (x[pairs.q % 8] >= place)]
     t = torch.from_numpy(place - x[chosen.p % 8])
-    yes = np.ones(len(t), dtype=bool)
-    smooth = (yes & (chosen.before != chosen.p), yes & (chosen.after != chosen.q))
-    result = blended(row, [Jumps(chosen, t, *smooth)]).numpy().reshape(2, 8)
-    integral = left * place + slope_left * place**2 / 2 + right * (8 - place) + slope_right * (64 - place**2) / 2
-    if smooth[0].all() and smooth[1].all():
-        assert result[0].sum() == pytest.approx(integral, rel=1e-9)
+    here = x[inside(chosen, t) % 8]
+    step = np.where(outside(chosen, t) == chosen.p, 1.0, -1.0) * (left(here) - right(here))
+    return blended(row, [Jumps(chosen, t, torch.from_numpy(step)[:, None])]).numpy().reshape(2, 8)[0]
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(0.6, 7.4), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_a_row_with_one_jump_has_the_right_area(place, left, right):
+    # Each pixel becomes its mean over its width, so sums are integrals.
+    result = row_with_a_jump(place, lambda x: left + 0.0 * x, lambda x: right + 0.0 * x)
+    assert result.sum() == pytest.approx(left * place + right * (8 - place), rel=1e-9)
+
+
+@pytest.mark.parametrize("place", [3.0, 3.5])
+def test_a_jump_that_passes_a_border_or_a_middle_changes_nothing_suddenly(place):
+    # However steep the functions are.
+    values = [row_with_a_jump(place + side * 1e-9, np.exp, lambda x: 40.0 - x**2) for side in (-1.0, 1.0)]
+    np.testing.assert_allclose(*values, rtol=1e-7)
 
 
 def test_a_jump_lies_where_its_function_is_zero():

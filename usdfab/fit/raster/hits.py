@@ -43,16 +43,30 @@ def meet(geometry: Geometry, lines: Polylines, seen: Seen) -> Meeting:
     The tangent is blended along the segment, so that it runs on smoothly in the next one, and h belongs to it: with the
     surface's normal projected across the tangent, as the tracer does.
     """
-    return Meeting(*_Meet.apply(lines.points, lines.tangents, lines.radius, geometry, seen))
+    return Meeting(*_Meet.apply(lines.points, lines.tangents, lines.radius, geometry, seen, 0.0))
+
+
+SIDE = 0.3
+"""Root of 1 - h^2 below which a place is at a fiber's side, for ``sides``."""
+
+
+def sides(geometry: Geometry, lines: Polylines, seen: Seen) -> Tensor:
+    """Distances (N,) as of ``meet``, of rays that go with the fibers' sides.
+
+    Along a ray that stays, the place where it enters a fiber moves the faster, the nearer it is to the fiber's side;
+    not so if the ray was aimed there because the fiber ends there.
+    """
+    distance: Tensor = _Meet.apply(lines.points, lines.tangents, lines.radius, geometry, seen, SIDE)[0]
+    return distance
 
 
 class _Meet(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, points: Tensor, tangents: Tensor, radius: Tensor, geometry: Geometry, seen: Seen
+        ctx: Any, points: Tensor, tangents: Tensor, radius: Tensor, geometry: Geometry, seen: Seen, side: float
     ) -> tuple[Tensor, Tensor, Tensor]:
         ctx.save_for_backward(points, tangents, radius)
-        ctx.geometry, ctx.seen = geometry, seen
+        ctx.geometry, ctx.seen, ctx.side = geometry, seen, side
         arguments = _arguments(points, tangents, radius, geometry, seen)
         n = len(geometry.start)
         distance, tangent, h = np.zeros(n), np.zeros((n, 3)), np.zeros(n)
@@ -61,19 +75,18 @@ class _Meet(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(
-        ctx: Any, by_distance: Tensor, by_tangent: Tensor, by_h: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, None, None]:
+    def backward(ctx: Any, by_distance: Tensor, by_tangent: Tensor, by_h: Tensor) -> tuple[Tensor | None, ...]:
         points_, tangents_, radius_ = ctx.saved_tensors
         arguments = _arguments(points_, tangents_, radius_, ctx.geometry, ctx.seen)
         points, tangents, radius = (np.zeros(tuple(t.shape)) for t in ctx.saved_tensors)
         given = (np.ascontiguousarray(as_numpy(g)) for g in (by_distance, by_tangent, by_h))
-        _meet_slopes(*arguments, *given, points, tangents, radius)
+        _meet_slopes(*arguments, ctx.side, *given, points, tangents, radius)
         scale = ctx.geometry.scale
         return (
             torch.from_numpy(points / scale),
             torch.from_numpy(tangents),
             torch.from_numpy(radius / scale),
+            None,
             None,
             None,
         )
@@ -129,8 +142,11 @@ def _smooth(ends, tangents, t, dx, dy, dz):
 
 
 @njit(**INLINE)
-def meeting_slopes(ends, tangents, radius, dx, dy, dz, by_t, by_tx, by_ty, by_tz, by_h):
-    """Derivatives of a loss by ends (6), tangents (6) and radius, from those by what ``meeting`` returns: 13 floats."""
+def meeting_slopes(ends, tangents, radius, dx, dy, dz, side, by_t, by_tx, by_ty, by_tz, by_h):
+    """Derivatives of a loss by ends (6), tangents (6) and radius, from those by what ``meeting`` returns: 13 floats.
+
+    Where the root of 1 - h^2 is less than ``side``, it has none.
+    """
     passing, middle, half = pass_by(ends, radius, dx, dy, dz)
     h = min(max(passing, -1.0), 1.0)
     root = math.sqrt(max(1.0 - h * h, 0.0) + EPSILON)
@@ -177,7 +193,7 @@ def meeting_slopes(ends, tangents, radius, dx, dy, dz, by_t, by_tx, by_ty, by_tz
 
     # q = t d - s; t = middle - half root, root^2 = 1 - h^2
     by_t += gx * dx + gy * dy + gz * dz
-    by_passing = by_t * half * h / root if -1.0 < passing < 1.0 else 0.0
+    by_passing = by_t * half * h / root if -1.0 < passing < 1.0 and root > side else 0.0
     s = pass_by_slopes(ends, radius, dx, dy, dz, by_passing, by_t, -by_t * root)
     return (
         s[0] - gx - by_cx, s[1] - gy - by_cy, s[2] - gz - by_cz, s[3] + by_cx, s[4] + by_cy, s[5] + by_cz,
@@ -223,7 +239,7 @@ _CHUNK = 64 * BLOCK
 
 @njit(**ENTRY, parallel=True)
 def _meet_slopes(
-    points_, radius_, tangents_, topology_, size_, start, direction, segment, copy, by_distance, by_tangent, by_h,
+    points_, radius_, tangents_, topology_, size_, start, direction, segment, copy, side, by_distance, by_tangent, by_h,
     by_points, by_tangents, by_radius,
 ):  # fmt: skip
     count = len(start)
@@ -246,7 +262,7 @@ def _meet_slopes(
                 thick = radius[topology[s, SYSTEM]]
                 found = meeting_slopes(
                     ends, _tangents_of(tangents, topology, s), thick, direction[k, 0], direction[k, 1], direction[k, 2],
-                    by_distance[k], by_tangent[k, 0], by_tangent[k, 1], by_tangent[k, 2], by_h[k],
+                    side, by_distance[k], by_tangent[k, 0], by_tangent[k, 1], by_tangent[k, 2], by_h[k],
                 )  # fmt: skip
                 for c in range(6):
                     ends_slopes[row, c], tangent_slopes[row, c] = found[c], found[6 + c]

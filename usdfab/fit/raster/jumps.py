@@ -8,7 +8,7 @@ than (a - d) / radius. So the jump function of the fiber is sqrt(h^2 + max(a - d
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from usdfab.fit.raster.curves import Polylines, as_numpy
-from usdfab.fit.raster.edges import Jumps, Pairs, crossing, crossing_slopes
+from usdfab.fit.raster.edges import Pairs, crossing, crossing_slopes
 from usdfab.fit.raster.hits import in_units
 from usdfab.fit.raster.segments import (
     BLOCK,
     INLINE,
     SYSTEM,
+    Floats,
     Geometry,
     add_to_ends,
     ends_of,
@@ -31,38 +32,98 @@ from usdfab.fit.raster.segments import (
     same_fiber,
     settled,
 )
-from usdfab.fit.raster.visibility import NOTHING, Seen
+from usdfab.fit.raster.visibility import NOTHING, PatchIndex, Seen, look_past, taken
 from usdfab.tracer.intrinsics import ENTRY, KERNEL, borrow
 
-NONE, P_ENDS, Q_ENDS = 0, 1, 2
-"""Between two pixels: no jump along this line of pixels; one where what p sees ends; or what q sees."""
+NONE, P_ENDS, Q_ENDS, GAP_P, GAP_Q = 0, 1, 2, 4, 8
+"""Between two pixels: no jump along this line of pixels; one where what p sees ends; or what q sees. Or there is a gap
+between both, narrower than the pixels' distance: bits that say whether the end of what p sees, and of what q sees,
+counts along this line."""
+
+ALONG_ROW, ALONG_COLUMN, ANY = 1, 0, 2
+"""Jumps that count: those more nearly normal to rows, to columns; all."""
 
 _TINY = 1e-12
 _LEAST_ROOT = 1e-9
 
 
-def visible_edges(
-    geometry: Geometry, lines: Polylines, seen: Seen, shadows: list[Seen], pairs: Pairs, along_row: bool
-) -> list[Jumps]:
-    """Where between pixels one fiber gives way to another, for ``edges.blended``.
+class Ends(NamedTuple):
+    """Where between pixels one fiber gives way to another, or to what lies behind it.
 
     Parameters
     ----------
+    pairs, t: (M,)
+        As of ``edges.Jumps``.
+    beyond: (M,)
+        What is on the other side of the jump, seen from the middle of the pixel with the jump: segments that lie beside
+        its ray.
+    here: (M,) or None
+        What is on this side; None: what the pixel sees.
+    """
+
+    pairs: Pairs
+    t: Tensor
+    beyond: Seen
+    here: Seen | None = None
+
+
+def visible_edges(
+    geometry: Geometry, lines: Polylines, index: PatchIndex, eye: Floats, seen: Seen, pairs: Pairs, along_row: bool
+) -> list[Ends]:
+    """Where between pixels one fiber gives way to another.
+
+    Parameters
+    ----------
+    index, eye:
+        Of what ``seen`` comes.
     pairs:
         All pairs along the rows or, if not ``along_row``, along the columns.
     """
     points, radius = in_units(geometry, lines.points, lines.radius)
     kinds = classified(geometry, points, radius, seen, pairs, along_row)
-    chosen = np.flatnonzero(kinds)
-    if not len(chosen):
-        return []
-    pairs, kinds = pairs[chosen], kinds[chosen]
-    t: Tensor = _Crossing.apply(lines.points, lines.radius, geometry, seen, pairs, kinds)
-    dark = np.stack([s.segment != NOTHING for s in shadows] or [np.zeros(len(seen.segment), dtype=bool)])
-    smooth_p, smooth_q = np.empty(len(chosen), dtype=np.bool_), np.empty(len(chosen), dtype=np.bool_)
-    _runs_on(geometry.topology, seen.segment, seen.copy, dark, pairs.p, pairs.before, smooth_p)
-    _runs_on(geometry.topology, seen.segment, seen.copy, dark, pairs.q, pairs.after, smooth_q)
-    return [Jumps(pairs, t, smooth_p, smooth_q)]
+    plain = np.flatnonzero((kinds == P_ENDS) | (kinds == Q_ENDS))
+    t, beside = _crossings(geometry, lines, seen, pairs[plain], kinds[plain], alone=False)
+    in_p = as_numpy(t) < 0.5
+    row = np.where((kinds[plain] == Q_ENDS) == in_p, 0, 2) + np.where(in_p, 0, 1)
+    found = [Ends(pairs[plain], t, _picked(beside, row))]
+    for bit, kind in ((GAP_P, P_ENDS), (GAP_Q, Q_ENDS)):
+        chosen = np.flatnonzero(kinds & bit)
+        t, beside = _crossings(
+            geometry, lines, seen, pairs[chosen], np.full(len(chosen), kind, dtype=np.int8), alone=True
+        )  # fmt: skip
+        in_p = as_numpy(t) < 0.5
+        at = np.where(in_p, pairs.p[chosen], pairs.q[chosen])
+        behind = look_past(
+            index, eye, geometry.direction[at], [taken(seen, pairs.p[chosen]), taken(seen, pairs.q[chosen])]
+        )  # fmt: skip
+        # In the pixel that sees the fiber, the gap is beyond; in the other, the fiber is, and the gap is here.
+        own = in_p == (kind == P_ENDS)
+        fiber = _picked(beside, np.where(in_p, 0, 1))
+        for rows, beyond, here in ((own, behind, None), (~own, fiber, behind)):
+            found.append(
+                Ends(
+                    pairs[chosen[rows]], t[torch.from_numpy(rows)], taken(beyond, rows),
+                    None if here is None else taken(here, rows),
+                )
+            )  # fmt: skip
+    return [ends for ends in found if len(ends.t)]
+
+
+def _crossings(
+    geometry: Geometry, lines: Polylines, seen: Seen, pairs: Pairs, kinds: NDArray[np.int8], alone: bool
+) -> tuple[Tensor, tuple[NDArray, NDArray]]:
+    """t (M,), and segments (4, M) with their copies: of what ends and of the other, each settled beside p and q.
+
+    ``alone`` is where the other does not matter.
+    """
+    beside, copies = np.empty((4, len(kinds)), dtype=np.int64), np.empty((4, len(kinds), 2), dtype=np.int64)
+    t: Tensor = _Crossing.apply(lines.points, lines.radius, geometry, seen, pairs, kinds, alone, beside, copies)
+    return t, (beside, copies)
+
+
+def _picked(beside: tuple[NDArray, NDArray], row: NDArray) -> Seen:
+    column = np.arange(len(row))
+    return Seen(*(each[row, column].astype(np.int32) for each in beside))
 
 
 def classified(
@@ -73,12 +134,43 @@ def classified(
     A jump counts along the axis to which it is more nearly normal. The fiber that ends is the one that is farther out
     at the other's pixel, and if both are beyond their sides there, the nearer.
     """
+    return _kinds_of(geometry, points, radius, seen, pairs, ALONG_ROW if along_row else ALONG_COLUMN)
+
+
+def _kinds_of(
+    geometry: Geometry, points: NDArray, radius: NDArray, seen: Seen, pairs: Pairs, axis: int
+) -> NDArray[np.int8]:
     kinds = np.zeros(len(pairs.p), dtype=np.int8)
     _classify(
         points, radius, geometry.topology, geometry.size, geometry.start, geometry.direction, seen.segment, seen.copy,
-        pairs.p, pairs.q, pairs.r, along_row, kinds,
+        pairs.p, pairs.q, pairs.r, axis, kinds,
     )  # fmt: skip
     return kinds
+
+
+def ends_between(geometry: Geometry, lines: Polylines, seen: Seen, pairs: Pairs) -> tuple[NDArray, Tensor, Tensor]:
+    """Where between pixels what p sees ends and what q sees begins, whichever way the jumps run.
+
+    Returns
+    -------
+    chosen: (M,)
+        Which of the pairs see different things.
+    end, begin: (M,)
+        In [0, 1] from p to q.
+    """
+    points, radius = in_units(geometry, lines.points, lines.radius)
+    kinds = _kinds_of(geometry, points, radius, seen, pairs, ANY)
+    chosen = np.flatnonzero(kinds)
+    kinds, pairs = kinds[chosen], pairs[chosen]
+    gap = kinds > Q_ENDS
+    order = torch.from_numpy(np.argsort(np.r_[np.flatnonzero(~gap), np.flatnonzero(gap)], kind="stable"))
+    plain, _ = _crossings(geometry, lines, seen, pairs[~gap], kinds[~gap], alone=False)
+    alone = [
+        _crossings(geometry, lines, seen, pairs[gap], np.full(int(gap.sum()), kind, dtype=np.int8), alone=True)[0]
+        for kind in (P_ENDS, Q_ENDS)
+    ]
+    end, begin = (torch.cat([plain, t])[order] for t in alone)
+    return chosen, end, begin
 
 
 class _Crossing(torch.autograd.Function):
@@ -86,16 +178,15 @@ class _Crossing(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, points: Tensor, radius: Tensor, geometry: Geometry, seen: Seen, pairs: Pairs, kinds: NDArray
-    ) -> Tensor:
+        ctx: Any, points: Tensor, radius: Tensor, geometry: Geometry, seen: Seen, pairs: Pairs, kinds: NDArray,
+        alone: bool, beside: NDArray, copies: NDArray,
+    ) -> Tensor:  # fmt: skip
+        """``beside`` (4, M) and ``copies`` (4, M, 2) are filled."""
         ctx.save_for_backward(points, radius)
         t = np.empty(len(kinds))
-        # Segments of what ends and of the other, each settled beside p and q, with their copies.
-        beside = np.empty((4, len(kinds)), dtype=np.int64)
-        copies = np.empty((4, len(kinds), 2), dtype=np.int64)
         _cross(
             *in_units(geometry, points, radius), geometry.topology, geometry.size, geometry.start, geometry.direction,
-            seen.segment, seen.copy, pairs.p, pairs.q, kinds, beside, copies, t,
+            seen.segment, seen.copy, pairs.p, pairs.q, kinds, alone, beside, copies, t,
         )  # fmt: skip
         ctx.geometry, ctx.pairs, ctx.beside, ctx.copies = geometry, pairs, beside, copies
         return torch.from_numpy(t)
@@ -112,7 +203,7 @@ class _Crossing(torch.autograd.Function):
             by_points, by_radius,
         )  # fmt: skip
         by_points, by_radius = by_points / geometry.scale, by_radius / geometry.scale
-        return torch.from_numpy(by_points), torch.from_numpy(by_radius), None, None, None, None
+        return torch.from_numpy(by_points), torch.from_numpy(by_radius), None, None, None, None, None, None, None
 
 
 @njit(**INLINE)
@@ -142,8 +233,14 @@ def _showing(h, axis, unit, behind):
     return math.sqrt(h * h + sunk * sunk + _TINY) - 1.0
 
 
+@njit(**INLINE)
+def _counts(row, column, axis):
+    """Whether a jump counts whose function changes so much along the row and along the column."""
+    return axis == ANY or (row >= column if axis == ALONG_ROW else row > column)
+
+
 @njit(**ENTRY, parallel=True)
-def _classify(points_, radius_, topology_, size_, start_, direction_, segment_, copy_, p, q, r, along_row, kinds):
+def _classify(points_, radius_, topology_, size_, start_, direction_, segment_, copy_, p, q, r, axis, kinds):
     count = len(p)
     for block in prange((count + BLOCK - 1) // BLOCK):
         points, radius, topology, size = borrow(points_), borrow(radius_), borrow(topology_), borrow(size_)
@@ -152,12 +249,12 @@ def _classify(points_, radius_, topology_, size_, start_, direction_, segment_, 
             at_p, at_q = p[m], q[m]
             if not same_fiber(topology, segment, copy, at_p, at_q):
                 kinds[m] = _kind(
-                    points, radius, topology, size, start, direction, segment, copy, at_p, at_q, r[m], along_row
+                    points, radius, topology, size, start, direction, segment, copy, at_p, at_q, r[m], axis
                 )
 
 
 @njit(**KERNEL)
-def _kind(points, radius, topology, size, start, direction, segment, copy, p, q, r, along_row):
+def _kind(points, radius, topology, size, start, direction, segment, copy, p, q, r, axis):
     a, b = np.int64(segment[p]), np.int64(segment[q])
     if a < 0 or b < 0:
         # One of them sees nothing behind: the other ends.
@@ -168,7 +265,7 @@ def _kind(points, radius, topology, size, start, direction, segment, copy, p, q,
         at_r = _profile(points, radius, topology, size, start, direction, s, i, j, r)
         here, row, column = math.sqrt(at_p[0] ** 2 + _TINY), at_q[0], at_r[0]
         row, column = abs(math.sqrt(row * row + _TINY) - here), abs(math.sqrt(column * column + _TINY) - here)
-        keep = row >= column if along_row else row > column
+        keep = _counts(row, column, axis)
         return (Q_ENDS if a < 0 else P_ENDS) if keep else NONE
     i, j = np.int64(copy[p, 0]), np.int64(copy[p, 1])
     a_p = _profile(points, radius, topology, size, start, direction, a, i, j, p)
@@ -180,6 +277,9 @@ def _kind(points, radius, topology, size, start, direction, segment, copy, p, q,
     b_r = _profile(points, radius, topology, size, start, direction, b, i, j, r)
     out_a, out_b = abs(a_q[0]), abs(b_p[0])
     if out_a > 1.0 and out_b > 1.0:
+        end_a, end_b = crossing(abs(a_p[0]) - 1.0, out_a - 1.0), crossing(out_b - 1.0, abs(b_q[0]) - 1.0)
+        if end_a < end_b:
+            return _gap(a_p[0], a_q[0], a_r[0], b_p[0], b_q[0], b_r[0], axis)
         a_ends = _depth(a_p[0], a_p[1], a_p[2]) <= _depth(b_q[0], b_q[1], b_q[2])
     else:
         a_ends = out_a > out_b
@@ -188,13 +288,26 @@ def _kind(points, radius, topology, size, start, direction, segment, copy, p, q,
     here = _showing(a_p[0], a_p[1], a_p[2], _depth(b_p[0], b_p[1], b_p[2]))
     row = abs(_showing(a_q[0], a_q[1], a_q[2], _depth(b_q[0], b_q[1], b_q[2])) - here)
     column = abs(_showing(a_r[0], a_r[1], a_r[2], _depth(b_r[0], b_r[1], b_r[2])) - here)
-    keep = row >= column if along_row else row > column
+    keep = _counts(row, column, axis)
     return (P_ENDS if a_ends else Q_ENDS) if keep else NONE
+
+
+@njit(**INLINE)
+def _gap(a_p, a_q, a_r, b_p, b_q, b_r, axis):
+    """Which ends of two fibers count along this line of pixels, from their h at p, q and r."""
+    kind = NONE
+    row, column = abs(abs(a_q) - abs(a_p)), abs(abs(a_r) - abs(a_p))
+    if _counts(row, column, axis):
+        kind |= GAP_P
+    row, column = abs(abs(b_q) - abs(b_p)), abs(abs(b_r) - abs(b_p))
+    if _counts(row, column, axis):
+        kind |= GAP_Q
+    return kind
 
 
 @njit(**ENTRY, parallel=True)
 def _cross(
-    points_, radius_, topology_, size_, start_, direction_, segment, copy, p, q, kinds, beside, copies, t
+    points_, radius_, topology_, size_, start_, direction_, segment, copy, p, q, kinds, alone, beside, copies, t
 ):  # fmt: skip
     count = len(p)
     for block in prange((count + BLOCK - 1) // BLOCK):
@@ -211,7 +324,7 @@ def _cross(
                 beside[side, m], copies[side, m, 0], copies[side, m, 1] = s, x, y
                 behind = math.inf
                 beside[2 + side, m] = NOTHING
-                if b >= 0:
+                if b >= 0 and not alone:
                     ho, axis_o, unit_o, s, x, y = _profile(
                         points, radius, topology, size, start, direction, b, k, n, at
                     )  # fmt: skip
@@ -312,14 +425,3 @@ def _showing_slopes(
     for c in range(6):
         ends_slopes[side, row, c] = found[c]
     radius_slopes[side, row] = found[6]
-
-
-@njit(**KERNEL)
-def _runs_on(topology, segment, copy, dark, near, far, result):
-    """Where pixels ``far`` show what ``near`` show, under the same lamps: colours do not run on past a shadow's rim."""
-    for m in range(len(near)):
-        a, b = near[m], far[m]
-        same = a != b and same_fiber(topology, segment, copy, a, b)
-        for lamp in range(len(dark)):
-            same = same and dark[lamp, a] == dark[lamp, b]
-        result[m] = same

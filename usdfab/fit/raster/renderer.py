@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,14 +13,15 @@ from usdfab.fabric import FabricParameters
 from usdfab.fabric.optics import optics_of
 from usdfab.fibers.patch import RASTERIZATION_VERTICES
 from usdfab.fit.raster.curves import CurveModel, Polylines, Shapes, as_numpy, raster_copies
-from usdfab.fit.raster.edges import blended, pixel_pairs
+from usdfab.fit.raster.edges import Ints, Jumps, blended, inside, outside, pixel_pairs
 from usdfab.fit.raster.hits import Meeting, meet
 from usdfab.fit.raster.jumps import visible_edges
+from usdfab.fit.raster.rims import light_beyond, rims_at_ends
 from usdfab.fit.raster.segments import geometry_of
 from usdfab.fit.raster.shade import Lighting, Look, cuticle_turns, materials, shaded
 from usdfab.fit.raster.shadows import shadow_edges
 from usdfab.fit.raster.view import View, view_of
-from usdfab.fit.raster.visibility import NOTHING, Seen, index_patch, look
+from usdfab.fit.raster.visibility import NOTHING, PatchIndex, Seen, index_patch, look, shadows_at, taken
 from usdfab.usd.scene import Camera, Scene
 
 PATCH_CELLS = 6
@@ -32,7 +33,8 @@ class RasterSettings:
     """How to rasterize.
 
     ``size`` (width, height) of the picture; ``supersampling`` squared pixels make one of them (the paper: 2 x 2).
-    ``single``, ``diffuse``, ``shadows``, ``edges`` switch off parts, for ablations. ``unshadowed`` of the diffuse term
+    ``single``, ``diffuse``, ``shadows``, ``edges`` switch off parts, for ablations. ``rims`` looks with own rays
+    at shadows where fibers end, which gradients need and pictures hardly show. ``unshadowed`` of the diffuse term
     is there in shadows, too; none in the paper, see ``shade_kernel.UNSHADOWED``. ``float64`` gives it in double
     precision, in which it is computed, for gradient checks.
     """
@@ -45,6 +47,7 @@ class RasterSettings:
     diffuse: bool = True
     shadows: bool = True
     edges: bool = True
+    rims: bool = True
     unshadowed: float = 0.0
     float64: bool = False
 
@@ -106,32 +109,81 @@ class RasterRenderer:
         geometry = self._geometry
         seen, shadows = look(index, self._view.eye, geometry.direction, lamps)
         met = meet(geometry, lines, seen)
-        lit = self._lit(lines, met, seen, shadows)
+        bare, rims = self._lit(index, lines, met, seen, shadows)
+        lit = _held(bare + rims[0] + rims[1])
         spread = self._pixel * geometry.scale / lines.radius
-        flat = shaded(geometry, seen, met, lit, spread, materials(look_, self._color_system), self._lighting)
-        if self.settings.edges:
-            parts = []
-            for pairs, along_row in zip(self._pairs, (True, False), strict=True):
-                parts += visible_edges(geometry, lines, seen, shadows, pairs, along_row)
-            flat = blended(flat, parts)
-        return self._view.gain * look_.gain * flat
+        material = materials(look_, self._color_system)
+        flat = shaded(geometry, seen, met, lit, spread, material, self._lighting)
+        if not self.settings.edges:
+            return self._view.gain * look_.gain * flat
 
-    def _lit(self, lines: Polylines, met: Meeting, seen: Seen, shadows: list[Seen]) -> Tensor:
-        """(N, lamps): how much of each lamp shines there."""
+        def light(at: Ints, what: Seen, lit: Tensor) -> Tensor:
+            """Of what would be seen in pixels ``at``."""
+            here = replace(geometry, start=geometry.start[at], direction=geometry.direction[at])
+            met = meet(here, lines, what)
+            return shaded(here, what, met, _held(lit), spread, material, self._lighting)
+
+        parts = []
+        for pairs, along_row in zip(self._pairs, (True, False), strict=True):
+            # Rims beside a jump lie before it or behind it; those that run across it are there on both sides.
+            across = rims[1 if along_row else 0]
+            for ends in visible_edges(geometry, lines, index, self._view.eye, seen, pairs, along_row):
+                at = inside(ends.pairs, ends.t)
+                near, far = torch.from_numpy(at), torch.from_numpy(outside(ends.pairs, ends.t))
+                lit_here, lit_there = bare[near] + across[near], bare[far] + across[far]
+                if len(lamps) and self.settings.rims:
+                    lit_there = light_beyond(geometry, lines, index, ends, seen, lamps, along_row) + across[far]
+                    if ends.here is not None:
+                        lit_here = self._lit_there(index, at, lines, ends.here)
+                own = light(at, taken(seen, at) if ends.here is None else ends.here, lit_here)
+                parts.append(Jumps(ends.pairs, ends.t, light(at, ends.beyond, lit_there) - own))
+        return self._view.gain * look_.gain * blended(flat, parts)
+
+    def _bare(self, shadows: list[Seen], count: int) -> Tensor:
+        """(N, lamps): 1 where a lamp shines, else 0."""
         if not shadows:
-            return torch.ones(len(met.h), len(self._view.lamps), dtype=torch.float64)
-        columns = []
-        for shadow, lamp in zip(shadows, self._view.lamps, strict=True):
-            shines = torch.from_numpy((shadow.segment == NOTHING).astype(np.float64))[:, None]
-            if self.settings.edges:
-                parts = []
-                for pairs, along_row in zip(self._pairs, (True, False), strict=True):
-                    parts += shadow_edges(
-                        self._geometry, lines, met.distance, seen, shadow, lamp, pairs, along_row
-                    )  # fmt: skip
-                shines = blended(shines, parts)
-            columns.append(shines)
-        return torch.cat(columns, dim=1)
+            return torch.ones(count, len(self._view.lamps), dtype=torch.float64)
+        return torch.from_numpy(np.stack([s.segment == NOTHING for s in shadows], axis=1).astype(np.float64))
+
+    def _lit_there(self, index: PatchIndex, at: Ints, lines: Polylines, what: Seen) -> Tensor:
+        """(M, lamps): 1 where a lamp shines on what would be seen in pixels ``at``, else 0."""
+        here = replace(self._geometry, start=self._geometry.start[at], direction=self._geometry.direction[at])
+        places = here.scale * (here.start + as_numpy(meet(here, lines, what).distance)[:, None] * here.direction)
+        return self._bare(shadows_at(index, places, what, what, self._view.lamps), len(at))
+
+    def _lit(
+        self, index: PatchIndex, lines: Polylines, met: Meeting, seen: Seen, shadows: list[Seen]
+    ) -> tuple[Tensor, list[Tensor]]:
+        """(N, lamps): 1 where a lamp shines on the middle of pixels, else 0; and what rims along rows and along columns
+        add to it."""
+        bare = self._bare(shadows, len(met.h))
+        none = torch.zeros_like(bare)
+        if not (shadows and self.settings.edges):
+            return bare, [none, none]
+        lamps, geometry = self._view.lamps, self._geometry
+        rims = []
+        for pairs, along_row in zip(self._pairs, (True, False), strict=True):
+            at_ends = (
+                rims_at_ends(geometry, lines, index, met.distance, seen, shadows, lamps, pairs, along_row)
+                if self.settings.rims else [[] for _ in lamps]
+            )  # fmt: skip
+            columns = []
+            for k, (shadow, lamp) in enumerate(zip(shadows, lamps, strict=True)):
+                shines = bare[:, k : k + 1]
+                parts = shadow_edges(
+                    geometry, lines, met.distance, shines, seen, shadow, lamp, pairs, along_row
+                )  # fmt: skip
+                column = blended(shines, parts) - shines
+                for pixels, light in at_ends[k]:
+                    column = column.index_add(0, pixels, light[:, None])
+                columns.append(column)
+            rims.append(torch.cat(columns, dim=1))
+        return bare, rims
+
+
+def _held(lit: Tensor) -> Tensor:
+    """Light held in [0, 1]; without slope at 0, as in the kernels."""
+    return torch.relu(lit) - torch.relu(lit - 1.0)
 
 
 def raster_renderer(scene: Scene, settings: RasterSettings) -> RasterRenderer:

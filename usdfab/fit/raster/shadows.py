@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from usdfab.fit.raster.curves import Polylines, as_numpy
-from usdfab.fit.raster.edges import Jumps, Pairs, crossing, crossing_slopes
+from usdfab.fit.raster.edges import Jumps, Pairs, crossing, crossing_slopes, inside, outside
 from usdfab.fit.raster.hits import in_units
 from usdfab.fit.raster.segments import (
     BLOCK,
+    EPSILON,
     INLINE,
     SYSTEM,
     Floats,
@@ -35,11 +36,13 @@ def shadow_edges(
     geometry: Geometry,
     lines: Polylines,
     distance: Tensor,
+    shines: Tensor,
     seen: Seen,
     shadow: Seen,
     lamp: Floats,
     pairs: Pairs,
     along_row: bool,
+    reach: Floats | None = None,
 ) -> list[Jumps]:
     """Rims of one lamp's shadows between pixels of the same fiber, for ``edges.blended``.
 
@@ -49,24 +52,29 @@ def shadow_edges(
     ----------
     distance: (N,)
         Of what the camera's rays meet.
+    shines: (N, 1)
+        1 where the lamp shines, 0 where not.
     lamp: (3,) metres
+    reach: (M,)
+        How far q is from p, in distances from p to r; 1 by default.
     """
+    reach = np.ones(len(pairs.p)) if reach is None else reach
     sign = np.zeros(len(pairs.p), dtype=np.int8)
     points, radius = in_units(geometry, lines.points, lines.radius)
     place = lamp / geometry.scale
     _classify(
         points, radius, geometry.topology, geometry.size, geometry.start, geometry.direction,
         np.ascontiguousarray(as_numpy(distance)), seen.segment, seen.copy, shadow.segment, shadow.copy, place,
-        pairs.p, pairs.q, pairs.r, along_row, sign,
+        pairs.p, pairs.q, pairs.r, reach, along_row, sign,
     )  # fmt: skip
     chosen = np.flatnonzero(sign)
     if not len(chosen):
         return []
     pairs, sign = pairs[chosen], sign[chosen]
     t: Tensor = _Crossing.apply(lines.points, lines.radius, distance, geometry, shadow, place, pairs, sign)
-    # Light and shadow are the same everywhere on their sides of the rim: nothing runs on.
-    flat = np.zeros(len(chosen), dtype=bool)
-    return [Jumps(pairs, t, flat, flat)]
+    # Light and shadow are the same everywhere on their sides of the rim.
+    step = shines[torch.from_numpy(outside(pairs, t))] - shines[torch.from_numpy(inside(pairs, t))]
+    return [Jumps(pairs, t, step)]
 
 
 class _Crossing(torch.autograd.Function):
@@ -109,9 +117,21 @@ class _Crossing(torch.autograd.Function):
 
 
 @njit(**INLINE)
-def _ray(start, direction, distance, lamp, at):
-    """From what pixel ``at`` sees to the lamp: (place (3), unit vector (3), length)."""
-    t = distance[at]
+def _met(points, radius, topology, size, start, direction, segment, copy, of, at):
+    """Distance at which the ray of pixel ``at`` meets, or passes beside, the fiber that pixel ``of`` sees."""
+    ox, oy, oz, dx, dy, dz = (
+        start[at, 0], start[at, 1], start[at, 2], direction[at, 0], direction[at, 1], direction[at, 2]
+    )  # fmt: skip
+    s, i, j = np.int64(segment[of]), np.int64(copy[of, 0]), np.int64(copy[of, 1])
+    s, i, j = settled(points, radius, topology, size, s, i, j, ox, oy, oz, dx, dy, dz)
+    ends = ends_of(points, topology, size, s, i, j, ox, oy, oz)
+    h, middle, half = pass_by(ends, radius[topology[s, SYSTEM]], dx, dy, dz)
+    return middle - half * math.sqrt(max(1.0 - h * h, 0.0) + EPSILON)
+
+
+@njit(**INLINE)
+def _ray(start, direction, t, lamp, at):
+    """From a distance along the ray of pixel ``at`` to the lamp: (place (3), unit vector (3), length)."""
     ox, oy, oz = (
         start[at, 0] + t * direction[at, 0], start[at, 1] + t * direction[at, 1], start[at, 2] + t * direction[at, 2]
     )  # fmt: skip
@@ -123,7 +143,13 @@ def _ray(start, direction, distance, lamp, at):
 @njit(**INLINE)
 def _cast(points, radius, topology, size, start, direction, distance, lamp, segment, i, j, at):
     """h of the fiber that casts the shadow, along the ray of pixel ``at``; and its segment there."""
-    ox, oy, oz, x, y, z, _ = _ray(start, direction, distance, lamp, at)
+    return _cast_at(points, radius, topology, size, start, direction, distance[at], lamp, segment, i, j, at)
+
+
+@njit(**INLINE)
+def _cast_at(points, radius, topology, size, start, direction, t, lamp, segment, i, j, at):
+    """The same for a place at distance t along that ray."""
+    ox, oy, oz, x, y, z, _ = _ray(start, direction, t, lamp, at)
     segment, i, j = settled(points, radius, topology, size, segment, i, j, ox, oy, oz, x, y, z)
     ends = ends_of(points, topology, size, segment, i, j, ox, oy, oz)
     return pass_by(ends, radius[topology[segment, SYSTEM]], x, y, z)[0], segment, i, j
@@ -132,7 +158,7 @@ def _cast(points, radius, topology, size, start, direction, distance, lamp, segm
 @njit(**ENTRY, parallel=True)
 def _classify(
     points_, radius_, topology_, size_, start_, direction_, distance_, segment_, copy_, caster, caster_copy, lamp_,
-    p, q, r, along_row, sign,
+    p, q, r, reach, along_row, sign,
 ):  # fmt: skip
     count = len(p)
     for block in prange((count + BLOCK - 1) // BLOCK):
@@ -143,19 +169,14 @@ def _classify(
             a, b, c = p[m], q[m], r[m]
             if (caster[a] < 0) == (caster[b] < 0) or segment[a] < 0 or not same_fiber(topology, segment, copy, a, b):
                 continue
-            # At r another fiber may be seen: then nothing tells how the rim runs, and rows take it.
-            aside = segment[c] >= 0 and same_fiber(topology, segment, copy, a, c)
-            if not aside and not along_row:
-                continue
             owner, lit = (a, b) if caster[a] >= 0 else (b, a)
             s, i, j = np.int64(caster[owner]), np.int64(caster_copy[owner, 0]), np.int64(caster_copy[owner, 1])
             at_p = _cast(points, radius, topology, size, start, direction, distance, lamp, s, i, j, a)[0]
             at_q = _cast(points, radius, topology, size, start, direction, distance, lamp, s, i, j, b)[0]
-            row, column = abs(at_q - at_p), 0.0
-            if aside:
-                column = abs(
-                    _cast(points, radius, topology, size, start, direction, distance, lamp, s, i, j, c)[0] - at_p
-                )
+            # At r another fiber may be seen. How the rim runs is told by the fiber of p there, or what lies beside it.
+            far = _met(points, radius, topology, size, start, direction, segment, copy, a, c)
+            at_r = _cast_at(points, radius, topology, size, start, direction, far, lamp, s, i, j, c)[0]
+            row, column = abs(at_q - at_p) / reach[m], abs(at_r - at_p)
             if row >= column if along_row else row > column:
                 beyond = at_p if lit == a else at_q
                 sign[m] = 1 if beyond > 0.0 else -1
@@ -236,7 +257,7 @@ def _cross_slopes(
 @njit(**INLINE)
 def _offset(points, radius, topology, size, start, direction, distance, lamp, beside, copies, m, side, at):
     """h of the caster's settled segment, and what it was made of: (h, ends, radius, unit vector (3), length)."""
-    ox, oy, oz, x, y, z, length = _ray(start, direction, distance, lamp, at)
+    ox, oy, oz, x, y, z, length = _ray(start, direction, distance[at], lamp, at)
     s = beside[side, m]
     ends = ends_of(points, topology, size, s, copies[side, m, 0], copies[side, m, 1], ox, oy, oz)
     thick = radius[topology[s, SYSTEM]]
