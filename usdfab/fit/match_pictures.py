@@ -13,7 +13,6 @@ from usdfab.fabric import FabricParameters
 from usdfab.imaging import denoise
 from usdfab.imaging.lens import photographed
 from usdfab.tracer import RenderSettings, Tracer
-from usdfab.tracer.cached_tracer import CachedTracer
 from usdfab.tracer.checkpoint import fingerprint
 from usdfab.tracer.patch_scene import PatchScene, build_tiles, redyed
 from usdfab.usd.rig import Rig, sample_scene
@@ -26,12 +25,6 @@ Singles = NDArray[np.float32]
 
 MOST_SPP = 32
 """Samples per pixel beyond which ``spend`` buys no more."""
-
-LEARNING = 0.35
-"""Share of the rays that a radiance cache learns from."""
-
-LEARNED_FROM = 2
-"""How many times smaller the picture is that a radiance cache learns from, along each side."""
 
 VARIED_CELLS = 16
 """Crossings of all variants of the repeat together beyond which pictures show fewer variants."""
@@ -51,15 +44,11 @@ class MatchPictures:
         Pixels along x, samples per pixel before the denoiser, and seed of the renders.
     later_scale:
         Least scale of azimuthal lobes after the first bounce, rad, see ``Tracer``; None: as they are.
-    learning:
-        Samples per pixel of the small picture that a radiance cache learns from (``CachedTracer``); 0: none is used.
     """
 
-    def __init__(
-        self, target: Target, width: int, spp: int, seed: int, later_scale: float | None = None, learning: int = 0
-    ) -> None:
+    def __init__(self, target: Target, width: int, spp: int, seed: int, later_scale: float | None = None) -> None:
         self.target, self.width, self.spp, self.seed = target, width, spp, seed
-        self.later_scale, self.learning = later_scale, learning
+        self.later_scale = later_scale
         weights = []
         for statistic, upper in zip(target.statistics, self._upper(target.statistics), strict=True):
             # Symmetric matrices: each pair off the diagonal stands for two entries.
@@ -80,23 +69,18 @@ class MatchPictures:
     def spend(self, rays: float, fabric: FabricParameters, rig: Rig | None) -> None:
         """Raise ``spp`` to what so many rays a pixel pay for: paths end soon in dark cloth.
 
-        A radiance cache gets its share of them. Deterministic: the rays of a small picture of the fabric are counted.
+        Deterministic: the rays of a small picture of the fabric are counted.
         """
         tracer, camera = self._tracer(fabric, rig)
         probe = self._settings(fabric, max(16, self.width // 6), 2)
         render = tracer.render(camera, probe)
         each = max(render.rays / max(float(render.samples.sum()), 1.0), 1.0)
-        if self.learning:
-            self.learning = max(self.learning, min(int(LEARNING * rays * LEARNED_FROM**2 / each), MOST_SPP))
-            rays = (1.0 - LEARNING) * rays
-            render = CachedTracer(tracer, camera, probe).render(camera, probe)
-            each = max(render.rays / max(float(render.samples.sum()), 1.0), 1.0)
         self.spp = max(self.spp, min(int(rays / each), MOST_SPP))
 
     def picture(self, fabric: FabricParameters, rig: Rig | None) -> Singles:
         """(H, W, 3) linear, denoised, at exposure 1, without the rig's blur."""
         sharp = replace(rig, blur=0.0) if rig else None
-        key = fingerprint(fabric, sharp, self.seed, self.spp, self.learning)
+        key = fingerprint(fabric, sharp, self.seed, self.spp)
         if key not in self._kept:
             self._kept[key] = self._rendered(fabric, sharp)
             while len(self._kept) > KEPT:
@@ -105,13 +89,7 @@ class MatchPictures:
 
     def _rendered(self, fabric: FabricParameters, rig: Rig | None) -> Singles:
         tracer, camera = self._tracer(fabric, rig)
-        settings = self._settings(fabric, self.width, self.spp)
-        if self.learning:
-            # Other paths than the picture's.
-            small = replace(self._settings(fabric, self.width // LEARNED_FROM, self.learning), seed=self.seed + 1000)
-            render = CachedTracer(tracer, camera, small).render(camera, settings)
-        else:
-            render = tracer.render(camera, settings)
+        render = tracer.render(camera, self._settings(fabric, self.width, self.spp))
         return denoise(render.pixels, render.albedo, render.normal)
 
     def _tracer(self, fabric: FabricParameters, rig: Rig | None) -> tuple[Tracer, Camera]:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-FORMAT = "usdfab-match/6"
+FORMAT = "usdfab-match/7"
 LONGEST_STEP = 2.0
 DAMPINGS = (0.01, 0.1, 1.0, 10.0)
 """Tried one after another until a step leads down; each iteration begins with the one that last did."""
@@ -67,8 +67,7 @@ class MatchSettings:
         Least scale of fibers' azimuthal lobes after the first bounce, rad, in these pictures (``Tracer``): less noise,
         while the brightness stays within about 2 %.
     look_rays:
-        The same for the first looks, which are many: their paths end at a radiance cache (``MatchPictures``), which
-        makes pictures of less noise but not differences between them. 0: they cost what the others do.
+        The same for the first looks, which are many. 0: they cost what the others do.
     iterations:
         Rounds of finite differences.
     steps:
@@ -128,7 +127,7 @@ SOFTER = 0.15
 """``later_scale`` of all qualities."""
 
 QUALITIES: dict[str, MatchSettings] = {
-    "draft": MatchSettings(width=192, rays=100, look_rays=50, later_scale=SOFTER, iterations=1, free=DRAFTED),
+    "draft": MatchSettings(width=192, rays=100, later_scale=SOFTER, iterations=1, free=DRAFTED),
     "standard": MatchSettings(rays=200, look_rays=100, later_scale=SOFTER),
     "paper": MatchSettings(width=360, spp=16, rays=500, look_rays=200, later_scale=SOFTER, iterations=4),
 }
@@ -317,9 +316,9 @@ class _Search:
             self._done += self._looks
             self._settle(exposure)
             return
-        if self.settings.look_rays:
-            self.pictures.learning = 1
-            self.pictures.spend(self.settings.look_rays, self.start.fabric, self.start.rig)
+        rays = self.settings.look_rays or self.settings.rays
+        if rays:
+            self.pictures.spend(rays, self.start.fabric, self.start.rig)
         looks: dict[Answers, _Look] = {}
 
         def loss_of(answers: Answers) -> float:
@@ -357,7 +356,7 @@ class _Search:
         if self.questions:
             # The best of many looks owes something to its noise, which steps would have to beat.
             self.pictures.seed = self.settings.seed + 1
-        self.pictures.learning, self.pictures.spp = 0, self.settings.spp
+        self.pictures.spp = self.settings.spp
         if self.settings.rays:
             self.pictures.spend(self.settings.rays, seen.fabric, seen.rig)
         self.picture, self.residuals, self.loss = self._look(self.state.point)
