@@ -100,6 +100,19 @@ def test_a_row_with_one_jump_has_the_right_area(place, left, right):
     assert result.sum() == pytest.approx(left * place + right * (8 - place), rel=1e-9)
 
 
+@settings(max_examples=100, deadline=None)
+@given(st.floats(0.6, 6.4), *[st.floats(-0.05, 0.05)] * 2, st.floats(0.5, 1.0), st.floats(0.5, 1.0))
+def test_straight_functions_miss_only_their_bend_in_the_strip(place, slope_left, slope_right, left, right):
+    # The strip from the jump to the pixel's border has the values of the pixel's middle: what the functions change from
+    # there to the strip is left out, and nothing else.
+    result = row_with_a_jump(place, lambda x: left + slope_left * x, lambda x: right + slope_right * x)
+    integral = left * place + slope_left * place**2 / 2 + right * (8 - place) + slope_right * (64 - place**2) / 2
+    away = abs(place - (math.floor(place) + 0.5))
+    missing = 0.5 * (slope_right - slope_left) * (0.25 - away**2)
+    # Which function fills the strip, and on which side of the middle it lies, change sign together.
+    assert result.sum() + missing == pytest.approx(integral, rel=1e-9)
+
+
 @pytest.mark.parametrize("place", [3.0, 3.5])
 def test_a_jump_that_passes_a_border_or_a_middle_changes_nothing_suddenly(place):
     # However steep the functions are.

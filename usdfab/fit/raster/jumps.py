@@ -129,10 +129,11 @@ def _picked(beside: tuple[NDArray, NDArray], row: NDArray) -> Seen:
 def classified(
     geometry: Geometry, points: NDArray, radius: NDArray, seen: Seen, pairs: Pairs, along_row: bool
 ) -> NDArray[np.int8]:
-    """(M,) ``NONE``, ``P_ENDS`` or ``Q_ENDS`` for pairs of pixels (M,).
+    """(M,) ``NONE``, ``P_ENDS``, ``Q_ENDS`` or bits of ``GAP_P`` and ``GAP_Q`` for pairs of pixels (M,).
 
     A jump counts along the axis to which it is more nearly normal. The fiber that ends is the one that is farther out
-    at the other's pixel, and if both are beyond their sides there, the nearer.
+    at the other's pixel, and if both are beyond their sides there, the nearer; or both do, where the one ends before
+    the other begins.
     """
     return _kinds_of(geometry, points, radius, seen, pairs, ALONG_ROW if along_row else ALONG_COLUMN)
 

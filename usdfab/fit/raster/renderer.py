@@ -16,7 +16,7 @@ from usdfab.fit.raster.curves import CurveModel, Polylines, Shapes, as_numpy, ra
 from usdfab.fit.raster.edges import Ints, Jumps, blended, inside, outside, pixel_pairs
 from usdfab.fit.raster.hits import Meeting, meet
 from usdfab.fit.raster.jumps import visible_edges
-from usdfab.fit.raster.rims import light_beyond, rims_at_ends
+from usdfab.fit.raster.rims import light_beyond, places_of, rims_at_ends
 from usdfab.fit.raster.segments import geometry_of
 from usdfab.fit.raster.shade import Lighting, Look, cuticle_turns, materials, shaded
 from usdfab.fit.raster.shadows import shadow_edges
@@ -148,7 +148,7 @@ class RasterRenderer:
     def _lit_there(self, index: PatchIndex, at: Ints, lines: Polylines, what: Seen) -> Tensor:
         """(M, lamps): 1 where a lamp shines on what would be seen in pixels ``at``, else 0."""
         here = replace(self._geometry, start=self._geometry.start[at], direction=self._geometry.direction[at])
-        places = here.scale * (here.start + as_numpy(meet(here, lines, what).distance)[:, None] * here.direction)
+        places = places_of(here, meet(here, lines, what).distance)
         return self._bare(shadows_at(index, places, what, what, self._view.lamps), len(at))
 
     def _lit(

@@ -64,7 +64,7 @@ def rims_at_ends(
         here = replace(geometry, start=geometry.start[at], direction=geometry.direction[at])
         far = sides(there, lines, fiber)
         distances = torch.cat([distance[torch.from_numpy(at)], far, sides(aside, lines, fiber)])
-        for k, cast in enumerate(shadows_at(index, _places(there, far), fiber, cover, lamps)):
+        for k, cast in enumerate(shadows_at(index, places_of(there, far), fiber, cover, lamps)):
             near = taken(shadows[k], at)
             for rims in _rims([here, there, aside], lines, distances, fiber, [near, cast], lamps[k], along_row,
                               as_numpy(reach)):  # fmt: skip
@@ -87,7 +87,7 @@ def light_beyond(
     near, far, beside = (sides(rays, lines, ends.beyond) for rays in (jump, border, aside))
     width = (ends.t - 0.5).abs().clamp(min=LEAST_REACH)
     first, second = (
-        shadows_at(index, _places(rays, d), ends.beyond, cover, lamps) for rays, d in ((jump, near), (border, far))
+        shadows_at(index, places_of(rays, d), ends.beyond, cover, lamps) for rays, d in ((jump, near), (border, far))
     )
     columns = []
     for k, lamp in enumerate(lamps):
@@ -134,7 +134,7 @@ def _between(geometry: Geometry, first: Ints, second: Ints, part: Floats) -> Geo
     return replace(geometry, start=start, direction=direction / np.linalg.norm(direction, axis=1, keepdims=True))
 
 
-def _places(rays: Geometry, distance: Tensor) -> Floats:
+def places_of(rays: Geometry, distance: Tensor) -> Floats:
     """Where rays are after a distance, metres."""
     return rays.scale * (rays.start + as_numpy(distance)[:, None] * rays.direction)
 
