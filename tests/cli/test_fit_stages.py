@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from usdfab.fabric.weave import satin
 from usdfab.fit import pipeline, raster_stage
 from usdfab.fit.raster_stage import StageSettings
 from usdfab.imaging import read_image, write_image
@@ -88,12 +89,29 @@ def test_no_fabric_has_an_exit_code_of_its_own(run: Run, tmp_path: Path, monkeyp
     assert json.loads(out)["analysis"]["lattice_confidence"] == 0.0
 
 
+def test_what_is_known_is_taken(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "fit_photo", partial(pipeline.fit_photo, albedo_paths=200))
+    output = tmp_path / "x.usda"
+    known = ("--weave", "satin 5/2", "--yarns", "12x12")
+    code, out, err = run("fit", PHOTO, "-o", output, "--size", "4mm", *known, "--json")
+    assert code == 0, err
+    fabric, result = read_fabric(output), json.loads(out)["analysis"]
+    assert fabric.weave.equivalent(satin(5, 2)) or fabric.weave.equivalent(satin(5, 3))
+    assert (fabric.warp.count, fabric.weft.count) == pytest.approx((12, 12), rel=0.2)
+    assert result["weave_confidence"] == result["warp"]["count_confidence"] == 1.0
+    # The sample is no satin.
+    assert "warning: The photo looks more like another weave than the one that was given: twill" in err
+    assert {"the weave was given", "the counts were given, about 12 ends and 12 picks"} <= set(fabric.provenance.notes)
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
         (("fit", PHOTO, "--stages", "analysis,magic"), "--stages: there is no stage 'magic'"),
         (("fit", PHOTO, "--stages", "path"), "--stages: the other stages start from the analysis"),
         (("fit", PHOTO, "--crop", "1,2,3"), "--crop: '1,2,3' is no region"),
+        (("fit", PHOTO, "--weave", "moire"), "--weave: unknown weave 'moire'; use one of basket,"),
+        (("fit", PHOTO, "--yarns", "12"), "--yarns: '12' are no counts of yarns; give ends across and picks down"),
         (("fit", PHOTO, "--stages", "raster"), "--stages: the other stages start from the analysis"),
         (("evaluate", "raster", "folder"), "folder: evaluate raster makes its own fabrics"),
         (("evaluate", "raster", "--count", 0), "--count: there is nothing to fit"),

@@ -22,6 +22,7 @@ from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, weave_from_name
 from usdfab.fit import features, later_stages, path_run, path_settings, path_stage, pipeline, raster_stage
 from usdfab.fit.analysis import PhotoAnalysis, analyze_photo
+from usdfab.fit.analysis.known import Known
 from usdfab.fit.course import TICKS, Course
 from usdfab.fit.fit_checkpoint import CheckpointFiles
 from usdfab.fit.path_settings import PathSettings
@@ -194,7 +195,12 @@ def test_ctrl_c_keeps_the_best_so_far(
 
 @pytest.mark.parametrize(
     ("changes", "named"),
-    [({"seed": 1}, "seed"), ({"pixel_size": 2e-5}, "size"), ({"crop": lambda w, h: (0, 0, w, h - 20)}, "crop")],
+    [
+        ({"seed": 1}, "seed"),
+        ({"pixel_size": 2e-5}, "size"),
+        ({"crop": lambda w, h: (0, 0, w, h - 20)}, "crop"),
+        ({"known": Known(counts=(9.0, 9.0))}, "known"),
+    ],
 )
 def test_a_foreign_checkpoint_is_refused(
     changes: dict, named: str, pretended: dict[str, int], photo: Path, tmp_path: Path

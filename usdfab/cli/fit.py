@@ -39,6 +39,19 @@ def run(
         str | None,
         Parameter(help="Use only X0,Y0,X1,Y1 of the picture: pixels from the top left, or e.g. 25%,25%,75%,75%."),
     ] = None,
+    weave: Annotated[
+        str | None,
+        Parameter(
+            help="The weave, where you know it, warp upright: plain, 'twill 2/1', 'satin 8/3', rows such as "
+            "1100/0110/0011/1001 (bottom row first, 1: weft on top), ... A direction that you do not say is found."
+        ),
+    ] = None,
+    yarns: Annotated[
+        str | None,
+        Parameter(
+            help="Ends across and picks down the picture, where you have counted them, e.g. 12x9; about is enough."
+        ),
+    ] = None,
     rig: Annotated[
         Path | None,
         Parameter(
@@ -88,6 +101,7 @@ def run(
         usdfab fit photo.png -o fabric.usda --size 3.6mm
         usdfab fit photo.tif -o fabric.usda --pixel-size 7.5um --report report --json
         usdfab fit photo.png -o fabric.usda --size 3.6mm --crop 100,100,900,700
+        usdfab fit photo.png -o fabric.usda --size 3.6mm --weave 'twill 2/2' --yarns 12x11
         usdfab fit photo.png -o fabric.usda --size 3.6mm --stages analysis,match --quality standard
         usdfab fit photo.png -o fabric.usda --rig microscope.usda --stages analysis,match
         usdfab fit photo.png -o fabric.usda --size 3.6mm --stages analysis,raster,path --quality standard --resume
@@ -100,6 +114,7 @@ def run(
     from usdfab.errors import UsdfabError
     from usdfab.fabric import as_table, parse_length
     from usdfab.files import checked_output
+    from usdfab.fit.analysis.known import Known, known_counts, known_weaves
     from usdfab.fit.fit_checkpoint import CheckpointFiles
     from usdfab.fit.pipeline import fit_photo
     from usdfab.fit.report import PAGE, check_report_folder, write_report
@@ -113,11 +128,11 @@ def run(
         checked_output(save_rig, USD_SUFFIXES, overwrite=overwrite)
         if rig is not None:
             raise UsdfabError("the rig is given: there is none to save", place="--save-rig", remedy="leave one out")
-    known = None
+    given_rig = None
     if rig is not None:
         from usdfab.usd.read_rig import read_rig
 
-        known = read_rig(rig)
+        given_rig = read_rig(rig)
     if report is not None:
         check_report_folder(report, overwrite=overwrite)
     if denoise:
@@ -127,6 +142,7 @@ def run(
     width = parse_length(size) if size else None
     pixel = parse_length(pixel_size) if pixel_size else None
     region = parse_region(crop, "--crop")
+    known = Known(known_weaves(weave) if weave else (), known_counts(yarns) if yarns else None)
     files = CheckpointFiles(output)
     left = files.existing()
     if left and not (resume or overwrite):
@@ -148,7 +164,8 @@ def run(
             checkpoint=files,
             resume=resume,
             force=force,
-            rig=known,
+            rig=given_rig,
+            known=known,
         )
     write_fabric(fit.fabric, output, overwrite=overwrite)
     if save_rig is not None:
@@ -175,7 +192,7 @@ def run(
                 "fabric": as_table(fit.fabric),
                 "analysis": _analysis(fit),
                 "exposure": fit.exposure,
-                "rig": None if fit.rig is None or known is not None else asdict(fit.rig),
+                "rig": None if fit.rig is None or given_rig is not None else asdict(fit.rig),
                 "stages": _stages(fit),
                 "pictures": {name: path for name, path in pictures.items() if name != PAGE},
                 "report": pictures.get(PAGE),

@@ -78,12 +78,13 @@ def _same_color(analysis: PhotoAnalysis) -> Doubt | None:
     apart = float(np.linalg.norm(warp - weft))
     if apart > SAME_COLOR:
         return None
+    weave = () if analysis.weave_known else ("weave",)
     # Li et al. 2024, figure 21.
     return Doubt(
         "same colour",
         f"warp and weft have one colour (they are {apart:.3f} apart, sRGB): the direction of their fibers alone tells "
         "which is on top",
-        ("weave", "albedo", "radius", "flattening", "crimp", "inclination"),
+        (*weave, "albedo", "radius", "flattening", "crimp", "inclination"),
     )
 
 

@@ -22,6 +22,7 @@ from usdfab.fit.albedo import (
     with_inverted_albedo_and_light,
 )
 from usdfab.fit.analysis import PhotoAnalysis, analyze_photo
+from usdfab.fit.analysis.known import NOTHING, Known
 from usdfab.fit.course import Course, Progress
 from usdfab.fit.doubts import Doubt, find_doubts
 from usdfab.fit.fit_checkpoint import CheckpointFiles, FitCheckpoint
@@ -72,6 +73,7 @@ def fit_photo(
     resume: bool = False,
     force: bool = False,
     rig: Rig | None = None,
+    known: Known = NOTHING,
 ) -> Fit:
     """Estimate a fabric from one photo.
 
@@ -102,6 +104,8 @@ def fit_photo(
     rig:
         Camera and lights of the photo, where they are known (``read_rig``). Otherwise the paper's, until the match
         stage finds that others explain the photo better.
+    known:
+        What people know of the cloth, which no stage changes then.
 
     Raises
     ------
@@ -125,12 +129,13 @@ def fit_photo(
     about = {
         "photo": photo.sha256, "size": photo.width, "crop": photo.box, "seed": seed, "paths": albedo_paths,
         "force": force, "rig": fingerprint(rig) if rig else None, "version": __version__,
+        "known": [[weave.rows() for weave in known.weaves], known.counts and list(known.counts)],
     }  # fmt: skip
     kept = FitCheckpoint.begin(checkpoint.fit if checkpoint else None, about, resume, rig)
     first = kept.finished(0, "analysis", "")
     course = Course(progress, ({} if first else {"analysis": ANALYSIS_SECONDS}) | later.costs())
     if first is None:
-        first = _analysed(photo, path, seed, albedo_paths, force, rig, kept, course.stage("analysis"))
+        first = _analysed(photo, path, seed, albedo_paths, force, known, rig, kept, course.stage("analysis"))
         kept.add("", first)
     course.finish("analysis")
     assert kept.photo is not None
@@ -151,6 +156,7 @@ def fit_photo(
         *_lamps(rig, found_rig),
         *_sharpness(rig, found_rig),
         *photo.notes,
+        *known.sentences(),
         *_confidences(analysis),
         *warnings,
         *prior_notes,
@@ -170,14 +176,14 @@ def fit_photo(
 
 
 def _analysed(
-    photo: Photo, path: str | Path, seed: int, albedo_paths: int, force: bool, rig: Rig | None, kept: FitCheckpoint,
-    say: Progress,
+    photo: Photo, path: str | Path, seed: int, albedo_paths: int, force: bool, known: Known, rig: Rig | None,
+    kept: FitCheckpoint, say: Progress,
 ) -> StageOutcome:  # fmt: skip
     """The first stage. What the photo showed goes into ``kept``."""
     begun = time.perf_counter()
     ladder, steps = len(LADDER), 2 + len(LADDER) + REFINEMENTS
     say("analysing", 1, steps)
-    analysis = analyze_photo(photo.pixels.astype(np.float64), str(path), force=force)
+    analysis = analyze_photo(photo.pixels.astype(np.float64), str(path), force=force, known=known)
     shown, prior_notes = fabric_from_analysis(analysis, photo.width, seed, _prim_name(Path(path).stem))
     curves = brightness_curves(
         shown, albedo_paths, seed=seed, rig=rig, progress=lambda done, _: say("measuring albedo", 2 + done, steps)

@@ -76,9 +76,8 @@ class StageSettings:
     iterations:
         Adam's steps, or rounds of Gauss-Newton, each of which takes a picture for each number (two where ``traced``).
     rate:
-        Size of Adam's steps in the space without bounds. The paper says 0.01 and not of what; there a number in the
-        middle of its range moves by 0.25 % of the range, and at most by a fifth of it in 75 steps. With 0.03 what
-        starts 20 % of its range off can come back.
+        Size of Adam's steps in the space without bounds (Li et al. 2024, 7.2). A number in the middle of its range
+        moves by 0.25 % of the range in a step of 0.01, and at most by a fifth of it in 75 steps.
     tied:
         Whether k_d is the multiple scattering that follows from C, measured with the path tracer before the first
         iteration, see ``raster.multiple``, and as such stands in shadows, too; else it is found like the rest and
@@ -103,7 +102,7 @@ class StageSettings:
     supersampling: int = 2
     steps: Steps = "adam"
     iterations: int = 75
-    rate: float = 0.03
+    rate: float = 0.01
     tied: bool = False
     traced: int = 0
     texture: float = 1.0

@@ -62,8 +62,9 @@ def analysis(
         )
 
     return SimpleNamespace(
-        warp=system(warp), weft=system(weft), weave=NAMED_WEAVES[weave], weave_confidence=sure, rotation=0.0
-    )
+        warp=system(warp), weft=system(weft), weave=NAMED_WEAVES[weave], weave_confidence=sure, rotation=0.0,
+        weave_known=False, counts_known=False,
+    )  # fmt: skip
 
 
 def shown(weave: str = "plain", warp: float = 10.1, weft: float = 19.8) -> FabricParameters:
@@ -100,6 +101,17 @@ def test_a_count_of_the_network_throws_the_weave_of_the_wrong_lattice_out() -> N
     assert fabric.warp.count == 20.2 and fabric.warp.yarn_albedo == () and fabric.weft.yarn_albedo != ()
     # The cover stays as the photo shows it.
     assert fabric.cover("warp") == pytest.approx(shown().cover("warp"))
+
+
+def test_what_was_given_is_not_overruled() -> None:
+    sees_other = guess("twill0", 0.99, warp=20.2)
+    seen = analysis("satin", 0.1, count_sure=0.02)
+    seen.weave_known = seen.counts_known = True
+    found = both(sees_other, seen, shown("satin"))
+    assert found.label == "satin" and found.weave is NAMED_WEAVES["satin"] and found.weave_confidence == 1.0
+    assert found.counts.tolist() == [10.1, 19.8] and found.notes == ()
+    seen.counts_known = False
+    assert both(sees_other, seen, shown("satin")).counts[0] == 20.2
 
 
 def test_the_weave_of_the_networks_own_lattice_is_no_evidence_for_another() -> None:

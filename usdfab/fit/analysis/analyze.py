@@ -14,6 +14,7 @@ from usdfab.fit.analysis.assumed import assumed_analysis
 from usdfab.fit.analysis.choose import Hypothesis, rank_hypotheses
 from usdfab.fit.analysis.evidence import LEAST_LATTICE, fine_slope, lattice_evidence
 from usdfab.fit.analysis.features import Array, extract
+from usdfab.fit.analysis.known import NOTHING, Known
 from usdfab.fit.analysis.rectify import STEP, Phase
 from usdfab.fit.analysis.result import PhotoAnalysis, YarnSystem
 from usdfab.fit.analysis.yarns import Blocks, colour_sequence, cut, gap_mask, twist, widths, yarn_colours
@@ -28,7 +29,9 @@ CLEAR = 10.0
 """Nats of lead over the next different answer that count as clear."""
 
 
-def analyze_photo(linear: ArrayLike, place: str = "photo", *, force: bool = False) -> PhotoAnalysis:
+def analyze_photo(
+    linear: ArrayLike, place: str = "photo", *, force: bool = False, known: Known = NOTHING
+) -> PhotoAnalysis:
     """Estimate yarn counts, weave, colours, widths, gaps and twist of the woven cloth on one photo.
 
     Use it on a photo taken square to the cloth, yarns within about 15 degrees of the image axes, showing 3 to about 45
@@ -42,6 +45,9 @@ def analyze_photo(linear: ArrayLike, place: str = "photo", *, force: bool = Fals
         What to call the photo in an error, usually its file name.
     force:
         Where no fabric is found, go on with the best guess and a warning that says so.
+    known:
+        What need not be found. A photo that looks more like another weave than the one that is given is not refused,
+        but a warning says so.
 
     Raises
     ------
@@ -63,8 +69,8 @@ def analyze_photo(linear: ArrayLike, place: str = "photo", *, force: bool = Fals
     scale = _working_scale(photo.shape)
     working = _resized(photo, scale)
     features = extract(working)
-    ranked = rank_hypotheses(features)
-    evidence = lattice_evidence(features, ranked[0]) if ranked else None
+    ranked = rank_hypotheses(features, known)
+    evidence = lattice_evidence(features, ranked[0], bool(known.weaves)) if ranked else None
     confidence = evidence.confidence if evidence else 0.0
     warnings: tuple[str, ...] = ()
     if confidence < LEAST_LATTICE:
@@ -72,30 +78,31 @@ def analyze_photo(linear: ArrayLike, place: str = "photo", *, force: bool = Fals
             "no woven lattice found: no spacing repeats across and down (fine detail has "
             f"{10 ** fine_slope(features):.0f} times less power than coarse)"
         )  # fmt: skip
-        if not force:
+        # Who names the weave says that there is one.
+        given = bool(known.weaves and ranked)
+        if not force and not given:
             raise NoFabricError(
                 problem,
                 place=place,
                 remedy="take a sharp photo square to the cloth that shows 5 to 40 yarns each way, or use --force",
             )
-        warnings = (_forced(problem),)
+        warnings = () if given else (_forced(problem),)
         if not ranked:
             return assumed_analysis(photo, warnings[0])
     best = ranked[0]
+    if known.weaves:
+        warnings += _contradiction(best, rank_hypotheses(features, Known(counts=known.counts)))
     blocks = cut(working, features, best)
     warp_f, weft_f = mean_frequency(best.warp), mean_frequency(best.weft)
     open_, gap_sure = gap_mask(blocks)
     warp_width, weft_width, gap_cover = widths(open_, blocks)
     tilts = (float(np.arctan2(warp_f[1], warp_f[0])), float(np.arctan2(-weft_f[0], weft_f[1])))
     h, w = working.shape[:2]
-    warp = _system(
-        False, blocks, w * warp_f[0], warp_f, scale, tilts[0], count_confidence(ranked, 0), warp_width, gap_sure
-    )
-    weft = _system(
-        True, blocks, h * weft_f[1], weft_f, scale, tilts[1], count_confidence(ranked, 1), weft_width, gap_sure
-    )
+    count_sure = [1.0 if known.counts else count_confidence(ranked, axis) for axis in (0, 1)]
+    warp = _system(False, blocks, w * warp_f[0], warp_f, scale, tilts[0], count_sure[0], warp_width, gap_sure)
+    weft = _system(True, blocks, h * weft_f[1], weft_f, scale, tilts[1], count_sure[1], weft_width, gap_sure)
     weave, certain = whole_repeat(best)
-    weave_sure = weave_confidence(ranked)
+    weave_sure = 1.0 if known.weaves else weave_confidence(ranked)
     partial = PhotoAnalysis(
         shape=(photo.shape[0], photo.shape[1]),
         warp=warp,
@@ -107,12 +114,26 @@ def analyze_photo(linear: ArrayLike, place: str = "photo", *, force: bool = Fals
         gap_confidence=gap_sure * confidence,
         weave=weave,
         weave_class=weave.classify(),
-        weave_confidence=weave_sure if certain else 0.5 * weave_sure,
+        weave_confidence=weave_sure if certain or known.weaves else 0.5 * weave_sure,
         lattice_confidence=confidence,
         warnings=warnings,
         detail=(evidence.sharpness.coarse, evidence.sharpness.fine, evidence.slope) if evidence else None,
+        weave_known=bool(known.weaves),
+        counts_known=known.counts is not None,
     )
     return _with_warnings(partial)
+
+
+def _contradiction(given: Hypothesis, free: list[Hypothesis]) -> tuple[str, ...]:
+    """Where the photo clearly looks like another weave than the given one, a sentence that says so."""
+    other = whole_repeat(free[0])[0]
+    lead = free[0].score - given.score
+    if lead < CLEAR or other.equivalent(whole_repeat(given)[0]):
+        return ()
+    return (
+        f"The photo looks more like another weave than the one that was given: {other.classify()}, "
+        f"{other.picks} x {other.ends} repeat, by {lead:.0f} nats.",
+    )
 
 
 def _forced(problem: str) -> str:

@@ -12,9 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from usdfab.fabric.weave import Weave
 from usdfab.fit.analysis.cells import CellMap, cell_map, channels
 from usdfab.fit.analysis.features import Array, Features
 from usdfab.fit.analysis.irregular import best_irregular
+from usdfab.fit.analysis.known import NOTHING, Known
 from usdfab.fit.analysis.patterns import PatternFit, best_regular
 from usdfab.fit.analysis.rectify import SUB, Grid, Phase, build_grid, demodulate
 from usdfab.fit.analysis.spectrum import Peak, axis_peaks, pair_prior, power, structure_rotation
@@ -59,11 +61,12 @@ class Hypothesis:
         return np.asarray(self.fit.pattern)[ids]
 
 
-def rank_hypotheses(features: Features) -> list[Hypothesis]:
+def rank_hypotheses(features: Features, known: Known = NOTHING) -> list[Hypothesis]:
     """All tried hypotheses, best first; empty where the photo has no pair of peaks."""
     spectrum = power(features)
     h, w = features.luma.shape
-    peaks = (axis_peaks(spectrum, 0, w), axis_peaks(spectrum, 1, h))
+    across, down = known.counts or (None, None)
+    peaks = (axis_peaks(spectrum, 0, w, near=across), axis_peaks(spectrum, 1, h, near=down))
     if not peaks[0] or not peaks[1]:
         return []
     best = (max(p.strength for p in peaks[0]), max(p.strength for p in peaks[1]))
@@ -76,14 +79,14 @@ def rank_hypotheses(features: Features) -> list[Hypothesis]:
     phases = _Phases(features, peaks)
     first = []
     for prior, a, b in pairs:
-        hypothesis = _best_on_pair(maps, phases.of(a), phases.of(b), prior)
+        hypothesis = _best_on_pair(maps, phases.of(a), phases.of(b), prior, known.weaves)
         if hypothesis is not None:
             first.append((hypothesis, prior))
     first.sort(key=lambda item: -item[0].score)
-    first = [(_refined(maps, hypothesis, prior), prior) for hypothesis, prior in first[:SEMIFINALISTS]]
+    first = [(_refined(maps, hypothesis, prior, known.weaves), prior) for hypothesis, prior in first[:SEMIFINALISTS]]
     first.sort(key=lambda item: -item[0].score)
     out = [hypothesis for hypothesis, _ in first]
-    for hypothesis, prior in first[:FINALISTS]:
+    for hypothesis, prior in () if known.weaves else first[:FINALISTS]:
         rectified = hypothesis.grid.sample(maps)
         oy, ox = hypothesis.cells.offset
         for dy, dx in ((0, 0), (SUB // 2, 0), (0, SUB // 2), (SUB // 2, SUB // 2)):
@@ -109,26 +112,27 @@ class _Phases:
         return self._known[peak]
 
 
-def _best_on_pair(maps: Array, warp: Phase, weft: Phase, prior: float) -> Hypothesis | None:
+def _best_on_pair(maps: Array, warp: Phase, weft: Phase, prior: float, weaves: tuple[Weave, ...]) -> Hypothesis | None:
     """The best regular weave over every second cell offset."""
     h, w = maps.shape[1:]
     grid = build_grid(warp, weft, (h, w))
     offsets = [(oy, ox) for oy in range(0, SUB, 2) for ox in range(0, SUB, 2)]
     rectified = grid.sample(maps)
-    found = best_regular([cell_map(rectified, grid.inside, offset) for offset in offsets])
+    found = best_regular([cell_map(rectified, grid.inside, offset) for offset in offsets], weaves=weaves)
     if found is None:
         return None
     fit, cells = found
     return Hypothesis(warp, weft, grid, cells, fit, fit.score + prior)
 
 
-def _refined(maps: Array, start: Hypothesis, prior: float) -> Hypothesis:
+def _refined(maps: Array, start: Hypothesis, prior: float, weaves: tuple[Weave, ...]) -> Hypothesis:
     """The same pair with yarn-dyed colours allowed, then with every cell offset next to the best one."""
     rectified = start.grid.sample(maps)
     best = (start.fit, start.cells)
     offsets = [(oy, ox) for oy in range(0, SUB, 2) for ox in range(0, SUB, 2)]
     for _ in range(2):
-        found = best_regular([cell_map(rectified, start.grid.inside, offset) for offset in offsets], dyed=True)
+        cells_by_offset = [cell_map(rectified, start.grid.inside, offset) for offset in offsets]
+        found = best_regular(cells_by_offset, dyed=True, weaves=weaves)
         if found is not None and found[0].score > best[0].score:
             best = found
         oy, ox = best[1].offset

@@ -118,14 +118,14 @@ class LatticeEvidence:
         )
 
 
-def lattice_evidence(features: Features, best: Hypothesis) -> LatticeEvidence:
-    """The evidence for a hypothesis."""
+def lattice_evidence(features: Features, best: Hypothesis, given: bool = False) -> LatticeEvidence:
+    """The evidence for a hypothesis; a weave that was ``given`` need not repeat on the photo: it agrees with itself."""
     h, w = features.luma.shape
     yarns = (abs(best.warp.fx) * w, abs(best.weft.fy) * h)
     return LatticeEvidence(
         float(best.fit.score),
         float(np.sqrt(best.warp.coherence * best.weft.coherence)),
-        fold_agreement(features, best),
+        1.0 if given else fold_agreement(features, best),
         yarns,
         zigzag(features, best),
         fine_slope(features),

@@ -13,8 +13,10 @@ from math import gcd
 import numpy as np
 from numpy.typing import NDArray
 
+from usdfab.fabric.weave import Weave
 from usdfab.fit.analysis.cells import CHROMA_A, CHROMA_B, FIBERS, LUMA, LUMA_U, LUMA_V, ORIENTATION, CellMap
 from usdfab.fit.analysis.features import LUMA_WEIGHTS, Array
+from usdfab.fit.analysis.known import phases
 from usdfab.fit.analysis.repeat import Lattice
 
 SAMPLES = 120.0
@@ -128,10 +130,13 @@ def gain(explained: Array) -> Array:
     return nats[..., 0] + trust * (nats[..., 1] + nats[..., 2])
 
 
-def best_regular(cells: list[CellMap], max_width: int = 8, dyed: bool = False) -> tuple[PatternFit, CellMap] | None:
+def best_regular(
+    cells: list[CellMap], max_width: int = 8, dyed: bool = False, weaves: tuple[Weave, ...] = ()
+) -> tuple[PatternFit, CellMap] | None:
     """The best regular weave over several cell offsets of one grid, with the offset it was found at.
 
-    ``dyed`` also lets every yarn have a colour of its own. All offsets must have the same number of cells.
+    ``dyed`` also lets every yarn have a colour of its own. All offsets must have the same number of cells. Where the
+    weave is known to be one of ``weaves``, regular or not, only these are tried.
     """
     cells = [c for c in cells if c.valid.sum() >= LEAST_CELLS]
     if not cells:
@@ -139,18 +144,19 @@ def best_regular(cells: list[CellMap], max_width: int = 8, dyed: bool = False) -
     vectors, valid = np.stack([c.vectors for c in cells]), np.stack([c.valid for c in cells])
     rows, cols = valid.shape[1:]
     best: tuple[PatternFit, CellMap] | None = None
-    for lattice, p, prior in _regular_weaves(max_width):
-        if lattice.width > cols or lattice.shape[0] > 2 * rows:
+    for lattice, p, prior in _known_weaves(weaves) if weaves else _regular_weaves(max_width):
+        if not weaves and (lattice.width > cols or lattice.shape[0] > 2 * rows):
             continue
         sums, counts = fold(vectors, valid, lattice)
         explained = pattern_variances(sums, counts, p)
-        if dyed and lattice.bits <= 4:
+        if dyed and (weaves or lattice.bits <= 4):
             likely = prior > -7
             matrices = p[likely][:, lattice.classes(rows, cols)]
             own = np.stack([yarn_dyed_variance(c, matrices) for c in cells])
             explained[:, likely, 2] = np.maximum(explained[:, likely, 2], own)
         score = gain(explained) + prior
-        score[counts.min(1) < 1] = -np.inf
+        if not weaves:
+            score[counts.min(1) < 1] = -np.inf
         b, k = np.unravel_index(int(score.argmax()), score.shape)
         if np.isfinite(score[b, k]) and (best is None or score[b, k] > best[0].score):
             best = (PatternFit(lattice, p[k], triple(explained[b, k]), float(score[b, k])), cells[b])
@@ -162,6 +168,13 @@ def _regular_weaves(max_width: int) -> tuple[tuple[Lattice, NDArray[np.bool_], A
     """(lattice, patterns, their log prior) of everything :func:`best_regular` tries."""
     out = [(x, patterns(x.width), pattern_prior(x.width, x.step)) for x in regular_lattices(max_width)]
     return tuple(out + [(x, p, np.full(len(p), -3.0 - BIT * x.bits)) for x, p in grouped_plain()])
+
+
+@lru_cache(maxsize=4)
+def _known_weaves(weaves: tuple[Weave, ...]) -> tuple[tuple[Lattice, NDArray[np.bool_], Array], ...]:
+    """The same of weaves that are known: none is likelier than the others."""
+    found = [phases(weave) for weave in weaves]
+    return tuple((lattice, tables, np.zeros(len(tables))) for lattice, tables in found)
 
 
 @lru_cache(maxsize=1)

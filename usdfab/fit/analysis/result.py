@@ -88,6 +88,8 @@ class PhotoAnalysis:
     detail: (float, float, float) or None
         How little fine detail there is, in decades of power: ``coarse`` and ``fine`` of ``evidence.YarnSharpness``, and
         ``evidence.fine_slope``.
+    weave_known, counts_known: bool
+        Whether these were given rather than found; their confidences are 1 then.
     """
 
     shape: tuple[int, int]
@@ -104,6 +106,8 @@ class PhotoAnalysis:
     lattice_confidence: float
     warnings: tuple[str, ...]
     detail: tuple[float, float, float] | None = None
+    weave_known: bool = False
+    counts_known: bool = False
 
     @property
     def warp_count(self) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from usdfab.fit.analysis.features import Array, Features, normalise
+from usdfab.fit.analysis.known import COUNT_SLACK
 
 WEDGE = np.radians(18.0)
 """Largest angle between a yarn frequency and its image axis."""
@@ -59,16 +60,21 @@ def power(features: Features) -> tuple[Array, Array, Array]:
     return total / len(maps), fx, fy
 
 
-def axis_peaks(spectrum: tuple[Array, Array, Array], axis: int, size: int, count: int = 8) -> list[Peak]:
+def axis_peaks(
+    spectrum: tuple[Array, Array, Array], axis: int, size: int, count: int = 8, near: float | None = None
+) -> list[Peak]:
     """The strongest peaks near the x axis (``axis`` 0, warp) or the y axis (1, weft) of :func:`power`.
 
     ``size`` is the image extent in pixels along that axis; frequencies from 2.5 cycles per image to one cycle per 8
-    pixels are considered.
+    pixels are considered; where the cycles per image are known to be ``near`` a number, only those about it, and if
+    none of these is a peak, this number itself.
     """
     p, fx, fy = spectrum
     gx, gy = np.meshgrid(fx, fy)
     along, across = (gx, gy) if axis == 0 else (gy, gx)
     allowed = (along * size >= 2.5) & (along <= 1 / 8) & (np.abs(across) * size <= along * size * np.tan(WEDGE) + 0.5)
+    if near is not None:
+        allowed &= np.abs(np.log(np.maximum(along * size, 1e-9) / near)) <= COUNT_SLACK
     top = (p == ndimage.maximum_filter(p, 5)) & allowed
     iy, ix = np.nonzero(top)
     order = np.argsort(-p[iy, ix])[:count]
@@ -81,6 +87,9 @@ def axis_peaks(spectrum: tuple[Array, Array, Array], axis: int, size: int, count
         double = highest[r2, c2] if 0 <= r2 < len(fy) and 0 <= c2 < len(fx) else 0.0
         tilt = np.arctan2(y, x) if axis == 0 else np.arctan2(-x, y)
         peaks.append(Peak(x, y, float(p[r, c] + HARMONIC * double), float(tilt)))
+    if near is not None and not peaks:
+        f = near / size
+        peaks.append(Peak(f, 0.0, 1.0, 0.0) if axis == 0 else Peak(0.0, f, 1.0, 0.0))
     return peaks
 
 

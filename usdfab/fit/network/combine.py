@@ -100,6 +100,9 @@ def combine(guess: Guess, analysis: PhotoAnalysis, shown: FabricParameters, skil
     counts, count_odds, moved = np.zeros(2), np.zeros(2), False
     for row, system in enumerate(SYSTEMS):
         seen = getattr(analysis, system)
+        if analysis.counts_known:
+            counts[row], count_odds[row] = seen.count, 1.0
+            continue
         counts[row], count_odds[row] = combined_count(guess, row, seen.count, seen.count_confidence)
         if abs(math.log(counts[row] / seen.count)) > SAME_COUNT:
             moved = True
@@ -111,6 +114,8 @@ def combine(guess: Guess, analysis: PhotoAnalysis, shown: FabricParameters, skil
     other_lattice = bool((np.abs(np.log(counts / guess.counts)) > SAME_COUNT).any())
     seen_weave = np.full(len(LABELS), 1.0 / len(LABELS)) if other_lattice and not moved else guess.weave
     odds = combined_weave(seen_weave, mine, confidence, trusted=not moved)
+    if analysis.weave_known:
+        odds = np.array([float(label == mine) for label in LABELS])
     label = LABELS[int(odds.argmax())]
     weave = analysis.weave
     if label != mine:
