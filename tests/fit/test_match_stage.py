@@ -25,6 +25,7 @@ from usdfab.fit.texture import Target
 from usdfab.imaging import denoise
 from usdfab.imaging.lens import through_lens
 from usdfab.tracer import RenderSettings, Tracer
+from usdfab.tracer.cached_tracer import CachedTracer
 from usdfab.usd.rig import rig_for, swatch_scene
 
 YARN = YarnParameters(count=3, radius=3e-4, fiber_count=6, albedo=(0.6, 0.4, 0.3), roughness_azimuthal=0.3)
@@ -41,7 +42,9 @@ def net(tmp_path_factory: pytest.TempPathFactory) -> FeatureNet:
 def goal() -> np.ndarray:
     # The draws of the stage's own pictures: with others, noise and not the search decides how near albedos come.
     scene = swatch_scene(CLOTH)
-    render = Tracer(scene).render(scene.cameras[0], RenderSettings((32, 32), spp=SMALL.spp, seed=SMALL.seed))
+    settings = RenderSettings((32, 32), spp=SMALL.spp, seed=SMALL.seed)
+    small = replace(settings, resolution=(16, 16), seed=SMALL.seed + 1000)
+    render = CachedTracer(Tracer(scene), scene.cameras[0], small).render(scene.cameras[0], settings)
     return 1.2 * denoise(render.pixels, render.albedo, render.normal)
 
 
@@ -158,11 +161,12 @@ def matched(net: FeatureNet, goal: np.ndarray) -> MatchResult:
 
 def test_colours_are_found_from_a_picture(matched: MatchResult) -> None:
     assert list(matched.losses) == sorted(matched.losses, reverse=True)
-    assert matched.losses[-1] < 0.4 * matched.losses[0]
+    assert matched.losses[-1] < 0.05 * matched.losses[0]
     assert not matched.interrupted
     for system in ("warp", "weft"):
         truth, start, found = (np.array(f.system(system).albedo) for f in (CLOTH, wrong(), matched.fabric))  # type: ignore[arg-type]
-        assert np.abs(found - truth).mean() < 0.6 * np.abs(start - truth).mean()
+        # The test's network of random filters hardly tells which system has how much of the blue.
+        assert np.abs(found - truth)[:2].mean() < 0.4 * np.abs(start - truth)[:2].mean()
     assert set(matched.uncertainty) == {f"{s}.albedo[{c}]" for s in ("warp", "weft") for c in "rgb"}
     assert matched.fabric.warp.radius == CLOTH.warp.radius
 
@@ -277,11 +281,30 @@ def test_dark_cloth_gets_more_samples_for_the_same_rays(net: FeatureNet, goal: n
     pictures = MatchPictures(Target.from_image(picture, net, (1,), "gram"), 32, 2, 0)
     found = []
     for albedo in ((0.95,) * 3, (0.05,) * 3):
-        pictures.spp = 2
+        pictures.spp = pictures.cached_spp = pictures.learning = 2
         dyed = replace(CLOTH, warp=replace(YARN, albedo=albedo), weft=replace(YARN, albedo=albedo))
         pictures.spend(120.0, dyed, None)
-        found.append(pictures.spp)
-    bright, dark = found
-    assert 2 < bright < dark <= MOST_SPP
+        found.append((pictures.spp, pictures.cached_spp, pictures.learning))
+    for bright, dark in zip(*found, strict=True):
+        assert 2 < bright <= dark <= MOST_SPP
+    # Paths that end at the cache are as long in both.
+    assert found[0][0] < found[1][0] and found[0][2] < found[1][2]
     pictures.spend(1.0, CLOTH, None)
-    assert pictures.spp == dark
+    assert (pictures.spp, pictures.cached_spp, pictures.learning) == found[1]
+
+
+def test_a_picture_is_nearer_to_the_cloth_than_a_sketch(net: FeatureNet, goal: np.ndarray) -> None:
+    """For the same rays. The denoiser makes much of few whole paths, where light scatters often."""
+    picture = torch.from_numpy(goal.astype(np.float32)).permute(2, 0, 1)
+    pictures = MatchPictures(Target.from_image(picture, net, (1,), "gram"), 48, 2, 0)
+    bright = replace(YARN, albedo=(0.97,) * 3, fiber_count=20)
+    white = replace(CLOTH, warp=bright, weft=bright)
+    pictures.spend(40.0, white, None)
+    scene = swatch_scene(white)
+    many = Tracer(scene).render(scene.cameras[0], RenderSettings((48, 48), spp=400, seed=5))
+    truth = denoise(many.pixels, many.albedo, many.normal)
+    far, near = (np.sqrt(np.mean((seen(white, None) - truth) ** 2)) for seen in (pictures.sketch, pictures.picture))
+    assert near < 0.7 * far
+    # Both are kept: they are made once.
+    assert pictures.picture(white, None) is pictures.picture(white, None)
+    assert pictures.sketch(white, None) is pictures.sketch(white, None)

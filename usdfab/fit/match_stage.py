@@ -2,7 +2,8 @@
 
 Everything that the tracer shows takes part: light that scatters many times, gaps, shadows between yarns, flyaways,
 plies. Derivatives of the texture statistics are finite differences between denoised pictures of the same random draws,
-one picture for each coordinate. There are few coordinates and the statistics are smooth in them, so a few Gauss-Newton
+one picture for each coordinate; what the photo is compared with is of another kind, which is not as smooth
+(``match_pictures``). There are few coordinates and the statistics are smooth in them, so a few Gauss-Newton
 steps do what gradient descent needs a hundred for; between two rounds of differences, derivatives are kept right by
 what the steps themselves show (Broyden 1965). The statistics are those of Li et al. 2024, eq. 12.
 """
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-FORMAT = "usdfab-match/7"
+FORMAT = "usdfab-match/8"
 LONGEST_STEP = 2.0
 DAMPINGS = (0.01, 0.1, 1.0, 10.0)
 """Tried one after another until a step leads down; each iteration begins with the one that last did."""
@@ -60,7 +61,7 @@ class MatchSettings:
     width:
         Pixels along x of the pictures that are compared.
     spp:
-        Samples per pixel of each picture, before the denoiser; at least.
+        Samples per pixel of each picture, before the denoiser, and of what its radiance cache learns from; at least.
     rays:
         Rays a pixel that a picture may cost; where they pay for more samples than ``spp``, there are more. 0: never.
     later_scale:
@@ -104,7 +105,7 @@ class MatchSettings:
         looks = most_looks(questions(self.shapes, rig_known=False))
         if self.look_rays and self.rays:
             looks = round(looks * self.look_rays / self.rays)
-        return looks + self.iterations * (coordinates + self.steps * len(DAMPINGS))
+        return looks + self.iterations * (1 + coordinates + self.steps * len(DAMPINGS))
 
     @property
     def samples(self) -> float:
@@ -127,7 +128,7 @@ SOFTER = 0.15
 """``later_scale`` of all qualities."""
 
 QUALITIES: dict[str, MatchSettings] = {
-    "draft": MatchSettings(width=192, rays=100, later_scale=SOFTER, iterations=1, free=DRAFTED),
+    "draft": MatchSettings(width=192, rays=100, look_rays=50, later_scale=SOFTER, iterations=1, free=DRAFTED),
     "standard": MatchSettings(rays=200, look_rays=100, later_scale=SOFTER),
     "paper": MatchSettings(width=360, spp=16, rays=500, look_rays=200, later_scale=SOFTER, iterations=4),
 }
@@ -304,7 +305,7 @@ class _Search:
         self.scale = settings.width / start.fabric.size[0]
         self.state = state or _State(0, np.zeros(len(self.space.names)), [], [np.zeros(len(self.space.names))])
         self._progress = progress or (lambda *_: None)
-        self._each = len(self.space.names) + settings.steps * len(DAMPINGS)
+        self._each = 1 + len(self.space.names) + settings.steps * len(DAMPINGS)
         self._looks = most_looks(self.questions)
         self._done = self.state.round * self._each
         self.loss = math.inf
@@ -356,7 +357,7 @@ class _Search:
         if self.questions:
             # The best of many looks owes something to its noise, which steps would have to beat.
             self.pictures.seed = self.settings.seed + 1
-        self.pictures.spp = self.settings.spp
+        self.pictures.spp = self.pictures.cached_spp = self.pictures.learning = self.settings.spp
         if self.settings.rays:
             self.pictures.spend(self.settings.rays, seen.fabric, seen.rig)
         self.picture, self.residuals, self.loss = self._look(self.state.point)
@@ -377,28 +378,32 @@ class _Search:
             matrix, gradient = normal_equations(self.residuals, jacobian, self.pictures.weights)
             if not self._step(matrix, gradient, jacobian):
                 # Where the quadratic misleads, one of the points that were looked at may still be a better one.
-                if step == 0 and nearby.loss < self.loss:
-                    self._take(nearby)
+                if step == 0 and (nearby != state.point).any():
+                    there = _Point(nearby, *self._look(nearby))
+                    if there.loss < self.loss:
+                        self._take(there)
                 break
         matrix, _ = normal_equations(self.residuals, jacobian, self.pictures.weights)
         state.deviations = self._deviations(matrix)
         state.round += 1
         self._done = before + self._each
 
-    def _jacobian(self) -> tuple[Singles, _Point]:
-        """Derivatives (P, R) at the point, and the best of the points that show them."""
+    def _jacobian(self) -> tuple[Singles, Floats]:
+        """Derivatives (P, R) at the point, and the best of the points that show them, if it is better."""
         rows = []
-        best = _Point(self.state.point, self.picture, self.residuals, self.loss)
+        here = self.state.point
+        sketched, start = self._sketch(here)
+        best, least = here, start
         for k, name in enumerate(self.space.names):
             ahead = self.state.point.copy()
             ahead[k] += 1.0
             if name in OF_THE_CAMERA:
-                moved = self._residuals(self.picture, ahead)
-            else:
-                picture, moved, loss = self._look(ahead)
-                if loss < best.loss:
-                    best = _Point(ahead, picture, moved, loss)
-            rows.append(moved - self.residuals)
+                rows.append(self._residuals(self.picture, ahead) - self.residuals)
+                continue
+            moved, loss = self._sketch(ahead)
+            if loss < least:
+                best, least = ahead, loss
+            rows.append(moved - sketched)
         return np.stack(rows), best
 
     def _take(self, there: _Point) -> None:
@@ -426,11 +431,21 @@ class _Search:
     def _look(self, point: Floats) -> tuple[Singles, Singles, float]:
         picture = self.pictures.picture(self.space.fabric(point), self.rig)
         residuals = self._residuals(picture, point)
-        prior = 0.5 * self.settings.prior * float(np.sum((point / self.space.spread) ** 2))
-        loss = soft_l1(residuals, self.pictures.weights) + prior
+        loss = self._loss(residuals, point)
         self._done += 1
         self._tell(min(loss, self.loss))
         return picture, residuals, loss
+
+    def _sketch(self, point: Floats) -> tuple[Singles, float]:
+        """Residuals and loss of a picture that is only compared with others of its kind."""
+        residuals = self._residuals(self.pictures.sketch(self.space.fabric(point), self.rig), point)
+        self._done += 1
+        self._tell(self.loss)
+        return residuals, self._loss(residuals, point)
+
+    def _loss(self, residuals: Singles, point: Floats) -> float:
+        prior = 0.5 * self.settings.prior * float(np.sum((point / self.space.spread) ** 2))
+        return soft_l1(residuals, self.pictures.weights) + prior
 
     def _residuals(self, picture: Singles, point: Floats) -> Singles:
         """Of a picture with the exposure and the blur of a point."""

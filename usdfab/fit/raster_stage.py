@@ -312,7 +312,7 @@ def _traced(
     def found(vector: torch.Tensor) -> torch.Tensor:
         parameters = picture_of.parameters
         natural = parameters.natural(vector)
-        picture = traced.picture(parameters.fabric_of(natural), rig)
+        picture = traced.sketch(parameters.fabric_of(natural), rig)
         gain = float(parameters.of(natural)[1].gain)
         return torch.from_numpy(traced.residuals(picture, gain, picture_of.blur))
 

@@ -86,9 +86,9 @@ def analyze_photo(
                 place=place,
                 remedy="take a sharp photo square to the cloth that shows 5 to 40 yarns each way, or use --force",
             )
-        warnings = () if given else (_forced(problem),)
         if not ranked:
-            return assumed_analysis(photo, warnings[0])
+            return assumed_analysis(photo, _forced(problem))
+        warnings = () if given else (_forced(problem),)
     best = ranked[0]
     if known.weaves:
         warnings += _contradiction(best, rank_hypotheses(features, Known(counts=known.counts)))
