@@ -1,4 +1,4 @@
-"""Pictures whose paths end at a radiance cache beside whole paths, as those that judge fits are. One JSON line.
+"""Pictures whose paths end at a radiance cache beside whole paths, as the match stage makes them. One JSON line.
 
     python tests/benchmarks/bench_radiance_cache.py [--smoke] [--fabrics linen denim silk-satin]
 
