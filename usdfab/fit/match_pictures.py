@@ -46,7 +46,7 @@ class MatchPictures:
     """Pictures of fabrics, and how their statistics differ from the target's.
 
     There are two kinds. What the denoiser makes of a few whole paths is smoother than the cloth: bright satin came as
-    near as 0.31 to its photo in 6 samples, and was 0.55 away in 400. Paths that end at a radiance cache say 0.55 for
+    near as 0.35 to its photo in 6 samples, and was 0.55 away in 400. Paths that end at a radiance cache say 0.55 for
     the price of the 6 samples. But caches that learned from two fabrics differ by more than the fabrics; whole paths of
     the same random draws do not. So pictures are of the first kind, and ``sketch`` gives the other, for differences.
 
