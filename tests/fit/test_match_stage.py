@@ -15,15 +15,16 @@ from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters, YarnParameters, weave_from_name
 from usdfab.fit import features, match_space, match_stage
 from usdfab.fit.features import FeatureNet
+from usdfab.fit.judge import Judge
 from usdfab.fit.match_pictures import MOST_SPP, MatchPictures
 from usdfab.fit.match_run import run_match
-from usdfab.fit.match_space import BLUR, BLUR_UNIT, EXPOSURE, MOVES, MatchSpace, Move
+from usdfab.fit.match_space import BLUR, BLUR_UNIT, CONTRAST, CONTRAST_RANGE, EXPOSURE, MOVES, MatchSpace, Move
 from usdfab.fit.match_stage import MatchPoint, MatchResult, MatchSettings, checked_match_quality, match_photo
 from usdfab.fit.match_steps import SOFT, broyden_update, damped_step, normal_equations, soft_l1
 from usdfab.fit.raster_stage import StageSettings
 from usdfab.fit.texture import Target
 from usdfab.imaging import denoise
-from usdfab.imaging.lens import through_lens
+from usdfab.imaging.lens import PIVOT, through_lens, toned
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.tracer.cached_tracer import CachedTracer
 from usdfab.usd.rig import rig_for, swatch_scene
@@ -217,7 +218,8 @@ def test_the_stage_is_used_only_where_it_comes_closer(
     monkeypatch.setattr(match_stage, "match_photo", lambda *_, **__: result)
     # The last point is the best of the stage's own pictures, but not seen better.
     distances = {"Matched": 0.3 if closer else 0.9, "Lucky": 0.4 if closer else 0.95}
-    monkeypatch.setattr("usdfab.fit.stages.traced_distance", lambda fabric, *_: distances[fabric.name])
+    monkeypatch.setattr(Judge, "picture", lambda _, fabric, *__: fabric.name)
+    monkeypatch.setattr(Judge, "distance", lambda _, name, *__: distances[name])
     judge = StageSettings(width=32, supersampling=1, iterations=1, levels=(1,))
     before, outcome = run_match(wrong(), goal, 0.0, SMALL, judge, exposure=1.2, distance=0.5)
     assert before == 0.5
@@ -251,10 +253,35 @@ def test_the_cameras_blur_is_found(
     assert result.losses[-1] < 0.1 * result.losses[0]
 
 
-def test_the_blur_of_a_known_rig_stays(goal: np.ndarray, net: FeatureNet) -> None:
-    settings = replace(SMALL, free=(BLUR, EXPOSURE))
-    rig = replace(rig_for(CLOTH.size), blur=1.2 * CLOTH.size[0] / settings.width)
-    photo = through_lens(goal, 1.2)
+@pytest.mark.parametrize("contrast", [1.4, 0.75])
+def test_the_cameras_contrast_is_found(contrast: float, goal: np.ndarray, net: FeatureNet) -> None:
+    """Colours, exposure and contrast from a photo that shows a power of the light."""
+    settings = replace(SMALL, free=("albedo", CONTRAST, EXPOSURE), iterations=4)
+    result = match_photo(CLOTH, toned(np.maximum(goal, 0.0), contrast), settings, net=net, exposure=1.2)
+    assert result.rig is not None
+    assert result.rig.contrast == pytest.approx(contrast, rel=0.1)
+    assert result.losses[-1] < 0.1 * result.losses[0]
+
+
+def test_contrast_leaves_the_photos_mean_as_bright_as_it_is() -> None:
+    space = MatchSpace.about(CLOTH, (CONTRAST, EXPOSURE), 1.4, contrast=1.2, level=0.05)
+    point = np.array([2.0, 0.0])
+    # What is 0.05 in the photo at the start.
+    start = (0.05 / PIVOT) ** (1 / 1.2) * PIVOT / 1.4
+    assert toned(np.full(1, 1.4 * start), 1.2) == pytest.approx(0.05)
+    assert toned(np.full(1, space.exposure(point) * start), space.contrast_at(point)) == pytest.approx(0.05)
+
+
+def test_contrast_moves_by_factors_and_stops() -> None:
+    space = MatchSpace.about(CLOTH, (CONTRAST,), contrast=1.2)
+    found = [space.contrast_at(np.array([x])) for x in (-100.0, 0.0, 1.0, 100.0)]
+    assert found == pytest.approx([CONTRAST_RANGE[0], 1.2, 1.2 * np.exp(0.1), CONTRAST_RANGE[1]])
+
+
+def test_the_camera_of_a_known_rig_stays(goal: np.ndarray, net: FeatureNet) -> None:
+    settings = replace(SMALL, free=(BLUR, CONTRAST, EXPOSURE))
+    rig = replace(rig_for(CLOTH.size), blur=1.2 * CLOTH.size[0] / settings.width, contrast=1.25)
+    photo = toned(through_lens(goal, 1.2), 1.25)
     known, sharp = (
         match_photo(CLOTH, photo, settings, net=net, exposure=1.2, rig=r, rig_known=True)
         for r in (rig, rig_for(CLOTH.size))

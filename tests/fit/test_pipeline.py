@@ -12,7 +12,7 @@ import pytest
 from cloth_drawing import Cloth, draw
 
 from usdfab.errors import UsdfabError
-from usdfab.fabric import FabricParameters, YarnParameters, weave_from_name
+from usdfab.fabric import SYSTEMS, FabricParameters, YarnParameters, weave_from_name
 from usdfab.fibers import generate_patch
 from usdfab.fit.albedo import (
     BrightnessCurve,
@@ -27,6 +27,8 @@ from usdfab.fit.analysis import PhotoAnalysis, YarnSystem
 from usdfab.fit.pipeline import DEFAULT_WIDTH, fit_photo
 from usdfab.fit.priors import assumed_notes, fabric_from_analysis
 from usdfab.imaging import write_image
+from usdfab.imaging.lens import toned
+from usdfab.usd.rig import rig_for
 
 CLOTH = FabricParameters(
     weave_from_name("plain"),
@@ -200,6 +202,26 @@ def test_size_comes_from_the_option_the_tags_or_the_default(photo: Path, tmp_pat
     tagged = tmp_path / "tagged.tif"
     write_image(tagged, draw(DRAWN), pixel_size=(8e-6, 8e-6))
     assert fit_photo(tagged, albedo_paths=FEW).fabric.size[0] == pytest.approx(240 * 8e-6, rel=0.01)
+
+
+def test_the_contrast_of_a_known_camera_is_taken_out_of_the_photo(tmp_path: Path) -> None:
+    """The same light through another camera is the same cloth."""
+    light = draw(DRAWN).astype(np.float32)
+    rig = replace(rig_for((3e-3, 3e-3)), contrast=1.5)
+    fits = []
+    for name, pixels, given in (("linear", light, replace(rig, contrast=1.0)), ("toned", toned(light, 1.5), rig)):
+        write_image(tmp_path / f"{name}.exr", pixels)
+        fits.append(fit_photo(tmp_path / f"{name}.exr", albedo_paths=FEW, rig=given))
+    first, second = fits
+    np.testing.assert_allclose(second.photo, first.photo, atol=1e-3)
+    for system in SYSTEMS:
+        one, other = (fit.fabric.system(system) for fit in fits)
+        assert other.radius == pytest.approx(one.radius, rel=1e-3)
+        seen = [getattr(fit.analysis, system).colour for fit in fits]
+        np.testing.assert_allclose(seen[1], seen[0], atol=5e-3)
+    assert second.rig == replace(rig, contrast=1.0)
+    assert any("contrast of 1.5" in note for note in second.fabric.provenance.notes)
+    assert not any("contrast" in note for note in first.fabric.provenance.notes)
 
 
 def test_contradictions_about_size_are_refused(photo: Path) -> None:

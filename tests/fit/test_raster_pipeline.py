@@ -29,6 +29,8 @@ from usdfab.fit.raster_evaluation import (
 from usdfab.fit.raster_stage import StageSettings
 from usdfab.fit.report import loss_curve
 from usdfab.fit.stages import checked_stages, run_raster
+from usdfab.tracer import RenderSettings, Tracer
+from usdfab.usd.rig import sample_scene
 
 QUICK = StageSettings(width=40, supersampling=1, iterations=2, rate=0.05, levels=(1, 2))
 YARN = YarnParameters(count=4, radius=2.4e-4, fiber_count=6, albedo=(0.5, 0.5, 0.5), roughness_azimuthal=0.2)
@@ -98,8 +100,8 @@ def test_the_raster_stage_is_used_only_where_it_comes_closer(
 
 def test_the_traced_distance_is_small_to_itself_and_not_to_another(quick_features: None) -> None:
     net = features.load_features()
-    own = fit_stages.sample_scene(CLOTH)
-    picture = fit_stages.Tracer(own).render(own.cameras[0], fit_stages.RenderSettings((40, 40), spp=32, seed=5)).pixels
+    own = sample_scene(CLOTH)
+    picture = Tracer(own).render(own.cameras[0], RenderSettings((40, 40), spp=32, seed=5)).pixels
     other = replace(CLOTH, warp=replace(YARN, albedo=(0.9, 0.2, 0.1)), weft=replace(YARN, radius=1e-4))
     near, far = (fit_stages.traced_distance(f, picture, QUICK, net) for f in (CLOTH, other))
     assert near < 0.3 * far

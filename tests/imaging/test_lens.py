@@ -1,4 +1,5 @@
-"""One signed number for a camera's sharpness: a linear map, symmetric, smooth at sharp, the same in numpy and torch."""
+"""One signed number for a camera's sharpness: a linear map, symmetric, smooth at sharp, the same in numpy and torch.
+And one for its contrast, which can be undone."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ import torch
 from hypothesis import given, strategies as st
 from scipy.ndimage import gaussian_filter
 
-from usdfab.imaging.lens import photographed, through_lens, through_lens_torch
+from usdfab.imaging.lens import PIVOT, photographed, through_lens, through_lens_torch, toned
 
 PICTURE = np.random.default_rng(0).random((18, 27, 3))
 
@@ -52,6 +53,24 @@ def test_sharpening_is_the_other_side_of_blurring() -> None:
 def test_a_photo_is_not_below_black() -> None:
     assert through_lens(PICTURE, -2.0).min() < 0.0 == photographed(PICTURE, -2.0).min()
     np.testing.assert_array_equal(photographed(PICTURE, 2.0), through_lens(PICTURE, 2.0))
+
+
+@given(contrast=st.floats(0.3, 3.0))
+def test_contrast_is_undone_by_its_inverse_and_keeps_middle_grey(contrast: float) -> None:
+    seen = toned(PICTURE, contrast)
+    np.testing.assert_allclose(toned(seen, 1.0 / contrast), PICTURE, rtol=1e-9, atol=1e-12)
+    assert toned(np.full(1, PIVOT), contrast) == pytest.approx(PIVOT)
+    # Ratios of light are what becomes more or less.
+    np.testing.assert_allclose(np.log(seen[0] / seen[1]), contrast * np.log(PICTURE[0] / PICTURE[1]), atol=1e-9)
+    assert toned(np.zeros(1), contrast) == 0.0
+
+
+def test_a_photo_is_through_the_lens_then_exposed_then_toned() -> None:
+    expected = toned(1.7 * np.maximum(through_lens(PICTURE, -1.2), 0.0), 1.3)
+    np.testing.assert_allclose(photographed(PICTURE, -1.2, 1.7, 1.3), expected)
+    single = photographed(PICTURE.astype(np.float32), -1.2, 1.7, 1.3)
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_many_pictures_at_once_and_their_type() -> None:

@@ -134,7 +134,7 @@ def test_a_ring_in_a_file_and_in_memory_agree(fabric, tmp_path):
 
 def test_a_rig_is_read_from_wherever_it_stands(fabric, tmp_path):
     """Turned, moved, in millimetres and y up: the same rig in its own frame."""
-    own = replace(ring_rig(SIZE, 0.8, 2, 0.3), blur=-2e-5)
+    own = replace(ring_rig(SIZE, 0.8, 2, 0.3), blur=-2e-5, contrast=1.3)
     path = write_rig(tmp_path / "r.usda", SIZE, rig=own)
     stage = Usd.Stage.CreateNew(str(tmp_path / "moved.usda"))
     UsdGeom.SetStageMetersPerUnit(stage, 0.001)
@@ -149,6 +149,7 @@ def test_a_rig_is_read_from_wherever_it_stands(fabric, tmp_path):
     np.testing.assert_allclose(rig.sample_size, SIZE, rtol=1e-5)
     assert rig.camera_height == pytest.approx(own.camera_height, rel=1e-5)
     assert rig.blur == pytest.approx(own.blur, rel=1e-6)
+    assert rig.contrast == own.contrast
     for light, position in zip(rig.lights, own.light_positions, strict=True):
         np.testing.assert_allclose(light.position, position, atol=1e-8)
     fabric = replace(fabric, size=SIZE)
@@ -201,7 +202,11 @@ def test_rigs_that_a_photo_cannot_have(tmp_path):
     def named(stage):
         stage.GetPrimAtPath("/Rig/Camera").CreateAttribute("usdfab:blur", Sdf.ValueTypeNames.String).Set("soft")
 
+    def inverted(stage):
+        stage.GetPrimAtPath("/Rig/Camera").CreateAttribute("usdfab:contrast", Sdf.ValueTypeNames.Double).Set(-1.0)
+
     for name, change, words in (
+        ("i.usda", inverted, "-1.0 is not a contrast above 0"),
         ("g.usda", endless, "nan is not a length"),
         ("h.usda", named, "'soft' is not a length"),
         ("a.usda", tilt, "3.0 degrees off its normal"),

@@ -11,17 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
-from usdfab.fabric import FabricParameters
 from usdfab.fit.fit_checkpoint import CheckpointFiles
+from usdfab.fit.judge import clear_picture, through_camera
 from usdfab.fit.pipeline import Fit, fit_photo
 from usdfab.fit.result_folder import made_folder, no_result, read_result, write_result
+from usdfab.fit.stages import StageOutcome
 from usdfab.fit.straighten import straightened
-from usdfab.imaging import denoise, linear_to_srgb, side_by_side, srgb_to_linear, write_image
-from usdfab.imaging.lens import photographed
-from usdfab.tracer import RenderSettings, Tracer
-from usdfab.tracer.cached_tracer import CachedTracer
+from usdfab.imaging import linear_to_srgb, side_by_side, srgb_to_linear, write_image
 from usdfab.usd.fabric_io import write_fabric
-from usdfab.usd.rig import Rig, blur_in_pixels, sample_scene
 
 if TYPE_CHECKING:
     from usdfab.fit.features import FeatureNet
@@ -172,7 +169,7 @@ def _fitted(
         raise KeyboardInterrupt
     write_fabric(fit.fabric, asset, overwrite=True)
     goal = photo_middle(fit)
-    pictures = {stage.name: stage.exposure * swatch(stage.fabric, seed, stage.rig) for stage in fit.stages}
+    pictures = {stage.name: swatch(stage, seed) for stage in fit.stages}
     write_image(folder / f"{photo.stem}.png", side_by_side([goal, *pictures.values()]), overwrite=True)
     distances = {name: gram_distance(goal, picture, net) for name, picture in pictures.items()}
     files.remove()
@@ -187,16 +184,13 @@ def photo_middle(fit: Fit) -> NDArray[np.float32]:
     return straightened(fit.photo[top : top + side, left : left + side], 0.0, 1.0, SIDE / side)
 
 
-def swatch(fabric: FabricParameters, seed: int = 0, rig: Rig | None = None) -> NDArray[np.float32]:
-    """A denoised picture of the whole fabric by the camera of ``rig``, ``SIDE`` pixels along its shorter side."""
-    scene = sample_scene(fabric, rig)
+def swatch(stage: StageOutcome, seed: int = 0) -> NDArray[np.float32]:
+    """What a stage found, as the photo's camera shows it: the whole fabric, ``SIDE`` pixels along its shorter side."""
+    fabric = stage.fabric
     scale = SIDE / min(fabric.size)
     size = (round(scale * fabric.size[0]), round(scale * fabric.size[1]))
-    small = RenderSettings((max(1, size[0] // 2), max(1, size[1] // 2)), spp=LEARNED, seed=seed + 1001)
-    cached = CachedTracer(Tracer(scene), scene.cameras[0], small)
-    render = cached.render(scene.cameras[0], RenderSettings(size, spp=SAMPLES, seed=seed + 1))
-    clean = denoise(render.pixels, render.albedo, render.normal)
-    return photographed(clean, blur_in_pixels(rig, scale))
+    clear = clear_picture(fabric, stage.rig, size, SAMPLES, LEARNED, seed=seed + 1)
+    return through_camera(clear, stage.rig, scale, stage.exposure)
 
 
 def _read_row(record: Path, about: dict[str, Any]) -> FitRow | None:

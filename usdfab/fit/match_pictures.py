@@ -14,7 +14,7 @@ from usdfab.fabric import FabricParameters
 from usdfab.imaging import denoise
 from usdfab.imaging.lens import photographed
 from usdfab.tracer import RenderSettings, Tracer
-from usdfab.tracer.cached_tracer import CachedTracer
+from usdfab.tracer.cached_tracer import LEARNED_FROM, CachedTracer, render_cached
 from usdfab.tracer.checkpoint import fingerprint
 from usdfab.tracer.patch_scene import PatchScene, build_tiles, redyed
 from usdfab.tracer.render import Render
@@ -31,9 +31,6 @@ MOST_SPP = 32
 
 LEARNING = 0.35
 """Share of the rays that a radiance cache learns from."""
-
-LEARNED_FROM = 2
-"""How many times smaller the picture is that a radiance cache learns from, along each side."""
 
 VARIED_CELLS = 16
 """Crossings of all variants of the repeat together beyond which pictures show fewer variants."""
@@ -94,13 +91,10 @@ class MatchPictures:
         self.cached_spp = max(self.cached_spp, min(int((1.0 - LEARNING) * rays / each), MOST_SPP))
 
     def picture(self, fabric: FabricParameters, rig: Rig | None) -> Singles:
-        """(H, W, 3) linear, denoised, at exposure 1, without the rig's blur; paths end at a radiance cache."""
+        """(H, W, 3) linear, denoised, at exposure 1, not through the rig's camera; paths end at a radiance cache."""
 
         def render(tracer: Tracer, camera: Camera) -> Render:
-            # Other paths than the picture's.
-            small = replace(self._settings(fabric, self.width // LEARNED_FROM, self.learning), seed=self.seed + 1000)
-            cached = CachedTracer(tracer, camera, small)
-            return cached.render(camera, self._settings(fabric, self.width, self.cached_spp))
+            return render_cached(tracer, camera, self._settings(fabric, self.width, self.cached_spp), self.learning)
 
         return self._kept_or(render, fabric, rig, (self.cached_spp, self.learning))
 
@@ -116,7 +110,7 @@ class MatchPictures:
         self, render: Callable[[Tracer, Camera], Render], fabric: FabricParameters, rig: Rig | None,
         spp: tuple[int, ...],
     ) -> Singles:  # fmt: skip
-        sharp = replace(rig, blur=0.0) if rig else None
+        sharp = replace(rig, blur=0.0, contrast=1.0) if rig else None
         key = fingerprint(fabric, sharp, self.seed, spp)
         if key not in self._kept:
             seen = render(*self._tracer(fabric, sharp))
@@ -142,8 +136,8 @@ class MatchPictures:
         size = (width, max(1, round(width * fabric.size[1] / fabric.size[0])))
         return RenderSettings(size, spp=spp, seed=self.seed)
 
-    def residuals(self, picture: Singles, exposure: float, blur: float = 0.0) -> Singles:
-        """What differs at an exposure, through a camera whose blur is given in pixels (``imaging.lens``).
+    def residuals(self, picture: Singles, exposure: float, blur: float = 0.0, contrast: float = 1.0) -> Singles:
+        """What differs at an exposure, through a camera of a blur, given in pixels, and a contrast (``imaging.lens``).
 
         (R,) differences of the statistics from the target's, each matrix in units of the target's mean entry, and of
         the mean colours, in units of the mean over the target's channels."""
@@ -152,9 +146,9 @@ class MatchPictures:
         from usdfab.fit.texture import rolled_off, texture_statistics
 
         target = self.target
-        seen = photographed(picture, blur)
+        seen = photographed(picture, blur, exposure, contrast)
         with torch.inference_mode():
-            image = torch.from_numpy(np.float32(exposure) * seen).permute(2, 0, 1)[None]
+            image = torch.from_numpy(seen).permute(2, 0, 1)[None]
             found = texture_statistics(image, target.net, target.levels, target.kind)
             parts = []
             for ours, theirs, scale, upper in zip(

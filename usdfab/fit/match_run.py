@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from numpy.typing import NDArray
 
 from usdfab.fabric import FabricParameters
-from usdfab.fit import stages
+from usdfab.fit.judge import Judge
 from usdfab.fit.stages import StageOutcome
 from usdfab.fit.straighten import straightened
 from usdfab.imaging import check_denoiser
@@ -74,11 +74,13 @@ def run_match(
     net = load_features(dtype=fast_dtype())
     fine = photo.shape[1] / start.size[0]
     goal, judged = (straightened(photo, rotation, fine, s.width / start.size[0]) for s in (settings, judge))
+    jury = Judge(judged, judge, net)
     steps = settings.pictures + 2
     say("judging the start of the match stage", 0, steps)
     before = distance
     if before is None:
-        before = stages.traced_distance(start, judged, judge, net, settings.seed, exposure, rig)
+        picture = jury.picture(start, rig, settings.seed)
+        before = jury.distance(picture, start.size[0], exposure, rig)
     result = match_photo(
         start, goal, settings, net=net, exposure=exposure, rig=rig, rig_known=rig_known, checkpoint=checkpoint,
         progress=lambda done, _, loss: say(f"match, loss {loss:.3f}", done, steps),
@@ -89,12 +91,15 @@ def run_match(
     say("judging the match stage", steps - 1, steps)
     # Other draws than those that were matched, and more of them: what came closer there by its noise does not here.
     way = result.way[-MOST_JUDGED:]
+    pictures = [jury.picture(p.fabric, p.rig, settings.seed + 2) for p in way]
     distances = [
-        stages.traced_distance(p.fabric, judged, judge, net, settings.seed + 2, p.exposure, p.rig) for p in way
+        jury.distance(picture, p.fabric.size[0], p.exposure, p.rig) for picture, p in zip(pictures, way, strict=True)
     ]
     after = min(distances)
-    best = way[distances.index(after)]
-    found, light, lamps, unsure = best.fabric, best.exposure, best.rig, result.uncertainty
+    best = distances.index(after)
+    found, light, lamps, unsure = way[best].fabric, way[best].exposure, way[best].rig, result.uncertainty
+    if not rig_known:
+        light, lamps, after = jury.settled(pictures[best], found, light, lamps)
     if not after < before:
         notes.append(f"the match stage did not come closer to the photo ({before:.3f}, then {after:.3f}): not used")
         found, light, lamps, unsure = start, exposure, rig, {}

@@ -10,13 +10,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from usdfab.errors import UsdfabError
 from usdfab.fabric import SYSTEMS, Color, FabricParameters, System, YarnParameters
+from usdfab.imaging.lens import PIVOT
+
+if TYPE_CHECKING:
+    from usdfab.fit.texture import Target
 
 Floats = NDArray[np.float64]
 Scale = Literal["linear", "log", "sqrt", "logit"]
@@ -34,7 +38,15 @@ by about so much."""
 BLUR_RANGE = (-1.5, 4.0)
 """Of ``b |b|``: twice the unit is where fibers are gone; sharper than the lower end, seams show."""
 
-OF_THE_CAMERA = (BLUR, EXPOSURE)
+CONTRAST = "contrast"
+CONTRAST_STEP = 0.1
+"""Of the camera's contrast's logarithm."""
+CONTRAST_RANGE = (0.6, 1.8)
+
+LEAST_LEVEL = 1e-3
+"""Of a photo that is not black."""
+
+OF_THE_CAMERA = (BLUR, CONTRAST, EXPOSURE)
 """Coordinates of the photo, not of the cloth: another picture is not needed to see what they do."""
 
 CHANNELS = "rgb"
@@ -111,17 +123,22 @@ class MatchSpace:
     start:
         The fabric at coordinates 0.
     names: (P,)
-        ``warp.radius``, ..., ``weft.albedo.b``, ``blur``, ``exposure``.
+        ``warp.radius``, ..., ``weft.albedo.b``, ``blur``, ``contrast``, ``exposure``.
     light:
         The exposure at coordinates 0.
-    blur:
-        ``Rig.blur`` at coordinates 0.
+    blur, contrast:
+        The rig's at coordinates 0.
+    level:
+        Light in a photo that more or less contrast leaves as bright as it is: the exposure follows. About the photo's
+        mean, so that contrast and exposure are not two names for one thing.
     """
 
     start: FabricParameters
     names: tuple[str, ...]
     light: float = 1.0
     blur: float = 0.0
+    contrast: float = 1.0
+    level: float = PIVOT
 
     @classmethod
     def about(
@@ -130,13 +147,15 @@ class MatchSpace:
         free: Sequence[str] = (*MOVES, *OF_THE_CAMERA),
         light: float = 1.0,
         blur: float = 0.0,
+        contrast: float = 1.0,
+        level: float = PIVOT,
     ) -> MatchSpace:
         """All coordinates of the parameters named.
 
         Raises
         ------
         UsdfabError
-            For a name that is not in ``MOVES``, and neither ``blur`` nor ``exposure``.
+            For a name that is neither in ``MOVES`` nor in ``OF_THE_CAMERA``.
         """
         for name in free:
             if name not in MOVES and name not in OF_THE_CAMERA:
@@ -148,7 +167,7 @@ class MatchSpace:
             if name in free
             for part in ([f".{c}" for c in CHANNELS] if name == "albedo" else [""])
         ]
-        return cls(start, (*names, *(name for name in OF_THE_CAMERA if name in free)), light, blur)
+        return cls(start, (*names, *(name for name in OF_THE_CAMERA if name in free)), light, blur, contrast, level)
 
     @property
     def spread(self) -> Floats:
@@ -165,7 +184,8 @@ class MatchSpace:
 
     def exposure(self, point: Floats) -> float:
         """What pictures are multiplied by at a point (P,)."""
-        return self.light * math.exp(EXPOSURE_STEP * self._steps(point, EXPOSURE))
+        kept = (self.level / PIVOT) ** (1.0 / self.contrast_at(point) - 1.0 / self.contrast)
+        return self.light * kept * math.exp(EXPOSURE_STEP * self._steps(point, EXPOSURE))
 
     def blur_at(self, point: Floats) -> float:
         """``Rig.blur`` at a point (P,), metres."""
@@ -177,6 +197,10 @@ class MatchSpace:
         low, high = min(BLUR_RANGE[0], start), max(BLUR_RANGE[1], start)
         square = min(max(start + BLUR_STEP * steps, low), high)
         return math.copysign(unit * math.sqrt(abs(square)), square)
+
+    def contrast_at(self, point: Floats) -> float:
+        """``Rig.contrast`` at a point (P,)."""
+        return Move("log", CONTRAST_STEP, *CONTRAST_RANGE).moved(self.contrast, self._steps(point, CONTRAST))
 
     def _steps(self, point: Floats, name: str) -> float:
         return float(point[self.names.index(name)]) if name in self.names else 0.0
@@ -195,6 +219,11 @@ class MatchSpace:
             key = f"{system}.{field}" + (f"[{channel[0]}]" if channel else "")
             result[key] = MOVES[field].deviation(float(value), float(deviation))
         return result
+
+
+def level_of(target: Target) -> float:
+    """Mean light of a photo, see ``MatchSpace``."""
+    return max(float(target.mean_color.float().mean()), LEAST_LEVEL)
 
 
 def _moved(yarn: YarnParameters, system: System, steps: dict[str, float]) -> YarnParameters:

@@ -23,7 +23,7 @@ from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
 from usdfab.fit.match_looks import Answers, Seen, best_answers, looks_at, most_looks, questions
 from usdfab.fit.match_pictures import MatchPictures
-from usdfab.fit.match_space import BLUR, EXPOSURE, MOVES, OF_THE_CAMERA, MatchSpace
+from usdfab.fit.match_space import BLUR, CONTRAST, MOVES, OF_THE_CAMERA, MatchSpace, level_of
 from usdfab.fit.match_steps import broyden_update, damped_step, normal_equations, soft_l1
 from usdfab.fit.stage_file import load_stage, save_stage
 from usdfab.tracer.checkpoint import fingerprint
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-FORMAT = "usdfab-match/8"
+FORMAT = "usdfab-match/9"
 LONGEST_STEP = 2.0
 DAMPINGS = (0.01, 0.1, 1.0, 10.0)
 """Tried one after another until a step leads down; each iteration begins with the one that last did."""
@@ -78,7 +78,7 @@ class MatchSettings:
     prior:
         Weight of the prior, see ``match_steps.damped_step``.
     free:
-        Names of ``match_space.MOVES``, ``exposure``, and ``blur``, which only moves where the rig is not known.
+        Names of ``match_space.MOVES`` and ``OF_THE_CAMERA``; where the rig is known, its blur and contrast do not move.
     seed:
         Of the renders.
     """
@@ -120,7 +120,8 @@ class MatchSettings:
 
 DRAFTED = (
     "radius", "flattening", "crimp", "twist", "waviness", "irregularity", "flyaway_density", "albedo_variation",
-    "roughness_azimuthal", "albedo", BLUR, EXPOSURE,
+    "roughness_azimuthal", "albedo",
+    *OF_THE_CAMERA,
 )  # fmt: skip
 """What a draft moves: what one round can settle, and is seen at its resolution."""
 
@@ -300,8 +301,9 @@ class _Search:
         self.pictures, self.settings, self.fresh = pictures, settings, state is None
         self.start, self.rig = start, start.rig
         self.questions = questions(settings.shapes, rig_known)
-        free = [name for name in settings.free if not (rig_known and name == BLUR)]
-        self.space = MatchSpace.about(start.fabric, free, exposure, start.rig.blur if start.rig else 0.0)
+        free = [name for name in settings.free if not (rig_known and name in (BLUR, CONTRAST))]
+        blur, contrast = (start.rig.blur, start.rig.contrast) if start.rig else (0.0, 1.0)
+        self.space = MatchSpace.about(start.fabric, free, exposure, blur, contrast, level_of(pictures.target))
         self.scale = settings.width / start.fabric.size[0]
         self.state = state or _State(0, np.zeros(len(self.space.names)), [], [np.zeros(len(self.space.names))])
         self._progress = progress or (lambda *_: None)
@@ -339,9 +341,10 @@ class _Search:
         self._done += 1
         picture = self.pictures.picture(seen.fabric, seen.rig)
         mean = float(self.pictures.mean.mean()) / max(exposure * float(picture.mean()), 1e-6)
+        blur, contrast = blur_in_pixels(seen.rig, self.scale), seen.rig.contrast if seen.rig else 1.0
         found = []
         for light in (*(mean * factor for factor in LIGHTS), *(() if answers else (1.0,))):
-            residuals = self.pictures.residuals(picture, exposure * light, blur_in_pixels(seen.rig, self.scale))
+            residuals = self.pictures.residuals(picture, exposure * light, blur, contrast)
             found.append(_Look(answers, light, picture, residuals, soft_l1(residuals, self.pictures.weights)))
         best = min(found, key=lambda look: look.loss)
         self.loss = min(self.loss, best.loss)
@@ -363,11 +366,11 @@ class _Search:
         self.picture, self.residuals, self.loss = self._look(self.state.point)
 
     def rig_at(self, point: Floats) -> Rig | None:
-        """Camera and lamps at a point; None is the paper's rig, which is sharp."""
-        blur = self.space.blur_at(point)
-        if self.rig is None and blur == 0.0:
+        """Camera and lamps at a point; None is the paper's rig, which is sharp and linear."""
+        blur, contrast = self.space.blur_at(point), self.space.contrast_at(point)
+        if self.rig is None and (blur, contrast) == (0.0, 1.0):
             return None
-        return replace(self.rig or rig_for(self.space.start.size), blur=blur)
+        return replace(self.rig or rig_for(self.space.start.size), blur=blur, contrast=contrast)
 
     def round(self) -> None:
         """One round of finite differences, and the steps that follow from it."""
@@ -448,8 +451,9 @@ class _Search:
         return soft_l1(residuals, self.pictures.weights) + prior
 
     def _residuals(self, picture: Singles, point: Floats) -> Singles:
-        """Of a picture with the exposure and the blur of a point."""
-        return self.pictures.residuals(picture, self.space.exposure(point), self.scale * self.space.blur_at(point))
+        """Of a picture through the camera of a point."""
+        blur = self.scale * self.space.blur_at(point)
+        return self.pictures.residuals(picture, self.space.exposure(point), blur, self.space.contrast_at(point))
 
     def _tell(self, loss: float) -> None:
         self._progress(self._done, self.settings.pictures, loss)

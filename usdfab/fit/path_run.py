@@ -14,6 +14,7 @@ from usdfab.fabric import FabricParameters
 from usdfab.fit import stages
 from usdfab.fit.stages import StageOutcome
 from usdfab.fit.straighten import straightened
+from usdfab.imaging.lens import toned
 from usdfab.usd.rig import Rig, blur_in_pixels, rig_for, swatch_scene
 
 if TYPE_CHECKING:
@@ -91,8 +92,9 @@ def run_path(
     scale = min(fine, OVERSAMPLING * settings.side / max(start.size))
     target = straightened(photo, rotation, fine, scale)
     seen = (target.shape[1] / scale, target.shape[0] / scale)
+    light = toned(target, 1.0 / rig.contrast if rig else 1.0) / np.float32(exposure)
     result = refine_appearance(
-        begin, target / np.float32(exposure), settings=settings,
+        begin, light, settings=settings,
         scene=swatch_scene(begin, (rig or rig_for(start.size)).with_sample(seen)), blur=blur_in_pixels(rig, scale),
         checkpoint=checkpoint, progress=lambda done, _, loss: say(f"path, loss {loss:.3f}", 1 + done, steps),
         keep_interrupted=True,

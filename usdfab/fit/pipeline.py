@@ -30,6 +30,7 @@ from usdfab.fit.later_stages import LaterStages
 from usdfab.fit.photo_input import DEFAULT_WIDTH as DEFAULT_WIDTH, Crop, Photo, load_photo
 from usdfab.fit.priors import assumed_notes, fabric_from_analysis
 from usdfab.fit.stages import StageOutcome, checked_stages
+from usdfab.imaging.lens import toned
 from usdfab.tracer.checkpoint import fingerprint
 from usdfab.usd.rig import Rig
 
@@ -41,10 +42,11 @@ ANALYSIS_SECONDS = 15.0
 class Fit:
     """A fitted fabric, what the photo showed, and what is uncertain.
 
-    ``photo`` is the linear picture (H, W, 3); ``size_source`` says where the physical size comes from; ``warnings``
-    are sentences for people; ``stages`` is what each stage found, in order; ``doubts`` are what in the photo makes the
-    fit unsure, and about which parameters. A render of the fabric under ``rig`` (None: the paper's), times
-    ``exposure``, is as bright as the photo.
+    ``photo`` is the linear picture (H, W, 3), without the contrast of a camera that was given; ``size_source`` says
+    where the physical size comes from; ``warnings`` are sentences for people; ``stages`` is what each stage found, in
+    order; ``doubts`` are what in the photo makes the fit unsure, and about which parameters. A render of the fabric
+    under ``rig`` (None: the paper's), times ``exposure``, through the rig's camera (``judge.through_camera``), is as
+    bright as the photo.
     """
 
     fabric: FabricParameters
@@ -116,6 +118,7 @@ def fit_photo(
         for a checkpoint of another fit.
     """
     wanted = checked_stages(stages)
+    camera = fingerprint(rig) if rig else None
     if albedo_paths is None:
         albedo_paths = PATHS // 3 if "match" in wanted else PATHS
     later = LaterStages.of(wanted, quality, seed, albedo_paths, checkpoint, rig)
@@ -123,12 +126,14 @@ def fit_photo(
         photo = replace(load_photo(path, rig.sample_size[0], None, crop), size_source="the rig")
     else:
         photo = load_photo(path, width, pixel_size, crop)
+    if rig is not None and rig.contrast != 1.0:
+        photo, rig = _linear(photo, rig)
     later.require_room(photo.pixels, str(path))
     if checkpoint is not None and not resume:
         checkpoint.remove()
     about = {
         "photo": photo.sha256, "size": photo.width, "crop": photo.box, "seed": seed, "paths": albedo_paths,
-        "force": force, "rig": fingerprint(rig) if rig else None, "version": __version__,
+        "force": force, "rig": camera, "version": __version__,
         "known": [[weave.rows() for weave in known.weaves], known.counts and list(known.counts)],
     }  # fmt: skip
     kept = FitCheckpoint.begin(checkpoint.fit if checkpoint else None, about, resume, rig)
@@ -154,7 +159,7 @@ def fit_photo(
         f"size from {photo.size_source}",
         light,
         *_lamps(rig, found_rig),
-        *_sharpness(rig, found_rig),
+        *_camera(rig, found_rig),
         *photo.notes,
         *known.sentences(),
         *_confidences(analysis),
@@ -217,11 +222,24 @@ def _lamps(given: Rig | None, found: Rig | None) -> list[str]:
     ]
 
 
-def _sharpness(given: Rig | None, found: Rig | None) -> list[str]:
-    if given is not None or found is None or found.blur == 0.0:
+def _linear(photo: Photo, rig: Rig) -> tuple[Photo, Rig]:
+    """A photo as a camera without contrast of its own would have made it, and the rig with that camera."""
+    note = f"the camera's contrast of {rig.contrast:.3g} was taken out of the photo"
+    pixels = toned(photo.pixels, 1.0 / rig.contrast)
+    return replace(photo, pixels=pixels, notes=(*photo.notes, note)), replace(rig, contrast=1.0)
+
+
+def _camera(given: Rig | None, found: Rig | None) -> list[str]:
+    if given is not None or found is None:
         return []
-    how = "is blurred" if found.blur > 0.0 else "looks sharpened"
-    return [f"the photo {how} by about {1e6 * abs(found.blur):.0f} micrometres on the cloth"]
+    notes = []
+    if found.blur != 0.0:
+        how = "is blurred" if found.blur > 0.0 else "looks sharpened"
+        notes.append(f"the photo {how} by about {1e6 * abs(found.blur):.0f} micrometres on the cloth")
+    if found.contrast != 1.0:
+        more = "more" if found.contrast > 1.0 else "less"
+        notes.append(f"the photo shows {more} contrast than the light had: its power {found.contrast:.2f}")
+    return notes
 
 
 def _confidences(analysis: PhotoAnalysis) -> list[str]:

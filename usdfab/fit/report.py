@@ -13,14 +13,14 @@ from usdfab.errors import UsdfabError
 from usdfab.files import whole_file
 from usdfab.fit.comparison import difference
 from usdfab.fit.course import Course
+from usdfab.fit.judge import through_camera
 from usdfab.fit.pipeline import Fit
 from usdfab.fit.report_page import report_page
 from usdfab.fit.straighten import straightened
 from usdfab.imaging import denoise, side_by_side, write_image
-from usdfab.imaging.lens import photographed
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.usd.drape import drape_scene
-from usdfab.usd.rig import blur_in_pixels, sample_scene
+from usdfab.usd.rig import sample_scene
 
 HEIGHT = 480
 """Rows of the report's pictures."""
@@ -86,7 +86,8 @@ def write_report(
     """
     target = Path(folder)
     earlier, curves = fit.stages[:-1], [stage for stage in fit.stages if len(stage.losses) > 1]
-    shown = {f"after_{stage.name}": (stage.fabric, stage.rig) for stage in earlier} | {"swatch": (fit.fabric, fit.rig)}
+    shown = {f"after_{stage.name}": (stage.fabric, stage.rig, stage.exposure) for stage in earlier}
+    shown["swatch"] = fit.fabric, fit.rig, fit.exposure
     names = ["photo", *shown, "comparison", "difference", "drape", *(f"{stage.name}_loss" for stage in curves)]
     paths = {name: target / f"{name}.png" for name in names} | {PAGE: target / f"{PAGE}.html"}
     check_report_folder(target, overwrite=overwrite)
@@ -99,7 +100,7 @@ def write_report(
         raise UsdfabError(f"cannot make the folder ({error.strerror})", place=str(target)) from error
     photo = resized(fit.photo, HEIGHT)
     size = (photo.shape[1], photo.shape[0])
-    scenes = {name: (sample_scene(*seen), size) for name, seen in shown.items()}
+    scenes = {name: (sample_scene(fabric, rig), size) for name, (fabric, rig, _) in shown.items()}
     scenes["drape"] = (drape_scene(fit.fabric, DRAPE_SIZE[0] / DRAPE_SIZE[1]), DRAPE_SIZE)
     course = Course(lambda _, done, total: progress(done, total) if progress else None, dict.fromkeys(scenes, 1.0))
     pictures = {"photo": photo}
@@ -114,9 +115,8 @@ def write_report(
         if name == "drape":
             pictures[name] = clean
         else:
-            fabric, rig = shown[name]
-            blur = blur_in_pixels(rig, resolution[0] / fabric.size[0])
-            pictures[name] = np.float32(fit.exposure) * photographed(clean, blur)
+            fabric, rig, exposure = shown[name]
+            pictures[name] = through_camera(clean, rig, resolution[0] / fabric.size[0], exposure)
     pictures["comparison"] = side_by_side([pictures["photo"], *(pictures[name] for name in shown)])
     scale = photo.shape[1] / fit.fabric.size[0]
     upright = straightened(fit.photo, fit.analysis.rotation, fit.photo.shape[1] / fit.fabric.size[0], scale)

@@ -15,11 +15,8 @@ from usdfab.errors import UsdfabError
 from usdfab.fabric import FabricParameters
 from usdfab.fit.albedo import LADDER, PATHS, REFINEMENTS, brightness_curves, with_inverted_albedo
 from usdfab.fit.extra import require_fit_extra
-from usdfab.imaging import denoise
-from usdfab.imaging.lens import photographed
-from usdfab.tracer import RenderSettings, Tracer
-from usdfab.tracer.cached_tracer import CachedTracer
-from usdfab.usd.rig import Rig, blur_in_pixels, sample_scene
+from usdfab.fit.judge import Judge
+from usdfab.usd.rig import Rig
 
 if TYPE_CHECKING:
     from usdfab.fit.features import FeatureNet
@@ -27,11 +24,6 @@ if TYPE_CHECKING:
 
 STAGES = ("analysis", "network", "raster", "match", "path")
 """In the order in which they run."""
-
-JUDGE_PATHS_PER_PIXEL = 12
-"""Of the pictures by which a stage's result is judged, before the denoiser, and of half as large ones from which their
-radiance cache learns. Undenoised, noise that is clipped at white outweighs the fit: on white yarns the distance was
-0.82 at 16 samples of whole paths and 0.68 at 64, 0.58 without noise."""
 
 Progress = Callable[[str, int, int], None]
 
@@ -204,23 +196,5 @@ def traced_distance(
 
     The swatch, under ``rig`` or the paper's, is multiplied by ``exposure`` and seen through the rig's camera.
     """
-    import torch
-
-    from usdfab.fit.raster_stage import render_size
-    from usdfab.fit.texture import Target, color_loss, texture_loss
-
-    scene = sample_scene(fabric, rig)
-    size = render_size(fabric, settings.width)
-    tracer, camera = Tracer(scene), scene.cameras[0]
-    small = (max(1, size[0] // 2), max(1, size[1] // 2))
-    cached = CachedTracer(tracer, camera, RenderSettings(small, spp=JUDGE_PATHS_PER_PIXEL, seed=seed + 1000))
-    render = cached.render(camera, RenderSettings(size, spp=JUDGE_PATHS_PER_PIXEL, seed=seed))
-    clean = denoise(render.pixels, render.albedo, render.normal)
-    blur = blur_in_pixels(rig, settings.width / fabric.size[0])
-    shown = np.float32(exposure) * photographed(clean, blur)
-    with torch.no_grad():
-        goal, image = (
-            torch.from_numpy(np.ascontiguousarray(p, dtype=np.float32)).permute(2, 0, 1) for p in (target, shown)
-        )
-        known = Target.from_image(goal, net, settings.levels, settings.kind)
-        return float(settings.texture * texture_loss(image, known) + settings.color * color_loss(image, known))
+    judge = Judge(target, settings, net)
+    return judge.distance(judge.picture(fabric, rig, seed), fabric.size[0], exposure, rig)

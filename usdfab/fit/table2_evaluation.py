@@ -232,7 +232,7 @@ def _fitted(job: _Job, weave: str, truth: FabricParameters) -> Table2Row:
         raise KeyboardInterrupt
     write_fabric(fit.fabric, asset, overwrite=True)
     job.say_fit("its pictures", 1, 1)
-    pictures = [stage.exposure * swatch(stage.fabric, job.seed) for stage in fit.stages]
+    pictures = [swatch(stage, job.seed) for stage in fit.stages]
     write_image(job.file(".png"), side_by_side([photo_middle(fit), *pictures]), overwrite=True)
     return judged(job.name, weave, truth, fit)
 

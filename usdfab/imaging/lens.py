@@ -1,4 +1,4 @@
-"""How sharply a camera shows things: one signed number, a blur or a sharpening.
+"""How a camera shows things: how sharply, which is one signed number, a blur or a sharpening, and in what contrast.
 
 A picture's components at the frequencies k of the cosine transform (radians per pixel, mirrored borders) are
 multiplied by
@@ -8,6 +8,9 @@ multiplied by
 
 which is smooth in ``b |b|`` at 0, keeps sums, and is its own transpose, so that derivatives go back through the same
 function.
+
+Cameras of cheap microscopes make pictures that please: bright things brighter, dark ones darker. Their response is
+taken for a power of the light, ``toned``.
 """
 
 from __future__ import annotations
@@ -20,6 +23,9 @@ from numpy.typing import NDArray
 from scipy import fft
 
 Floats = NDArray[np.float64]
+
+PIVOT = 0.18
+"""Light that all contrasts show alike: middle grey."""
 
 
 def through_lens(picture: NDArray, blur: float) -> NDArray:
@@ -40,9 +46,24 @@ def through_lens(picture: NDArray, blur: float) -> NDArray:
     return soft if blur > 0.0 else 2.0 * picture - soft
 
 
-def photographed(picture: NDArray, blur: float) -> NDArray:
-    """:func:`through_lens` as a photo shows it: sharpening goes below black, which no photo does."""
-    return np.maximum(through_lens(picture, blur), picture.dtype.type(0.0))
+def toned(picture: NDArray, contrast: float) -> NDArray:
+    """Light of 0 or more in the contrast of a camera; ``1 / contrast`` undoes it.
+
+    ``PIVOT (x / PIVOT)^contrast``: 1 is a camera whose files say how much light there was.
+    """
+    if contrast == 1.0:
+        return picture
+    pivot, power = (picture.dtype.type(x) for x in (PIVOT, contrast))
+    return pivot * (picture / pivot) ** power
+
+
+def photographed(picture: NDArray, blur: float, exposure: float = 1.0, contrast: float = 1.0) -> NDArray:
+    """A picture (..., H, W, C) as a photo shows it: through the lens, exposed, toned.
+
+    Sharpening goes below black, which no photo does: that is 0.
+    """
+    seen = np.maximum(through_lens(picture, blur), picture.dtype.type(0.0))
+    return toned(picture.dtype.type(exposure) * seen, contrast)
 
 
 def through_lens_torch(image: Any, blur: float) -> Any:

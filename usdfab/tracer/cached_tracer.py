@@ -4,6 +4,7 @@ right."""
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 
@@ -22,6 +23,12 @@ DEPTH = 3
 
 STRIPS = 16
 """Of the small picture, each learned from by itself."""
+
+LEARNED_FROM = 2
+"""How many times smaller the picture is that ``render_cached`` learns from, along each side."""
+
+OTHER_PATHS = 1000
+"""Added to a picture's seed: a cache that learned from the picture's own paths would keep their errors."""
 
 
 class CachedTracer:
@@ -70,3 +77,16 @@ class CachedTracer:
         """As ``Tracer.render``; light that was scattered ``depth`` times or more is the cache's."""
         sample = partial(self._tracer.sample, cache=self.cache)
         return render_by(sample, camera, settings, self._tracer.segments, progress)
+
+
+def render_cached(tracer: Tracer, camera: Camera, settings: RenderSettings, learning: int) -> Render:
+    """A picture whose paths end at a radiance cache, learned from other paths of a smaller one.
+
+    Parameters
+    ----------
+    learning:
+        Samples per pixel of the smaller picture.
+    """
+    width, height = (max(1, side // LEARNED_FROM) for side in settings.resolution)
+    small = replace(settings, resolution=(width, height), spp=learning, seed=settings.seed + OTHER_PATHS)
+    return CachedTracer(tracer, camera, small).render(camera, settings)

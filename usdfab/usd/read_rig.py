@@ -12,7 +12,7 @@ from pxr import Usd, UsdGeom
 
 from usdfab.errors import UsdfabError
 from usdfab.usd.read_scene import read_scene
-from usdfab.usd.rig import BLUR_ATTRIBUTE, Rig
+from usdfab.usd.rig import BLUR_ATTRIBUTE, CONTRAST_ATTRIBUTE, Rig
 from usdfab.usd.scene import Camera, Light, Scene
 from usdfab.usd.stage import open_stage
 
@@ -30,8 +30,8 @@ def read_rig(path: str | Path) -> Rig:
     """The rig on a stage: its first camera, all its lights, and the surface that the camera looks at.
 
     The camera's axis meets the sample in its middle, at a right angle; the picture's width and height there are
-    ``sample_size``. A camera's exposure goes into the strength of the lights; its ``BLUR_ATTRIBUTE``, if it has one,
-    says how sharp its photos are.
+    ``sample_size``. A camera's exposure goes into the strength of the lights; its ``BLUR_ATTRIBUTE`` and
+    ``CONTRAST_ATTRIBUTE``, if it has them, say how its photos show what it sees.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def read_rig(path: str | Path) -> Rig:
     width, depth = (float(f"{2.0 * height * float(t):.6g}") for t in camera.tan_half)
     return Rig(
         (width, depth), camera_height=height, lights=tuple(_moved(light, to_rig, gain) for light in scene.lights),
-        blur=_blur(stage, camera, place),
+        blur=_blur(stage, camera, place), contrast=_contrast(stage, camera, place),
     )  # fmt: skip
 
 
@@ -76,6 +76,15 @@ def _blur(stage: Usd.Stage, camera: Camera, place: str) -> float:
     # In the units of the camera's own frame, which may be scaled into the stage's.
     axis = UsdGeom.Imageable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default()).GetRow3(0)
     return float(value) * axis.GetLength() * float(UsdGeom.GetStageMetersPerUnit(stage))
+
+
+def _contrast(stage: Usd.Stage, camera: Camera, place: str) -> float:
+    value = stage.GetPrimAtPath(camera.path).GetAttribute(CONTRAST_ATTRIBUTE).Get()
+    if value is None:
+        return 1.0
+    if not isinstance(value, (int, float)) or not (math.isfinite(value) and value > 0):
+        raise UsdfabError(f"{value!r} is not a contrast above 0", place=f"{place}.{CONTRAST_ATTRIBUTE}")
+    return float(value)
 
 
 def _sample_below(scene: Scene, camera: Camera, place: str) -> tuple[float, Floats]:

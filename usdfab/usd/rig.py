@@ -32,6 +32,8 @@ PLANE_FACTOR = 3.0
 MAX_LAMPS = 64
 BLUR_ATTRIBUTE = "usdfab:blur"
 """Of a rig's camera, double, in the units of its own frame: ``Rig.blur``."""
+CONTRAST_ATTRIBUTE = "usdfab:contrast"
+"""Of a rig's camera, double: ``Rig.contrast``."""
 _LAMP_RADIUS = 1e-3
 _FOCAL_LENGTH = 50.0
 
@@ -58,6 +60,8 @@ class Rig:
     blur:
         On the sample: how far the camera blurs (standard deviation) or, with a minus sign, how widely it sharpens, see
         ``imaging.lens``. Pictures that are compared with its photos show it, scenes do not.
+    contrast:
+        Power of the light that its photos show, see ``imaging.lens.toned``; as ``blur``, of its photos only.
     """
 
     sample_size: tuple[float, float]
@@ -68,6 +72,7 @@ class Rig:
     azimuth: float = 0.0
     lights: tuple[Light, ...] | None = None
     blur: float = 0.0
+    contrast: float = 1.0
 
     def __post_init__(self) -> None:
         if len(self.sample_size) != 2:
@@ -84,6 +89,8 @@ class Rig:
             raise UsdfabError(f"{self.light_side} is not a length", place="light_side")
         if not math.isfinite(self.blur):
             raise UsdfabError(f"{self.blur} is not a length", place="blur")
+        if not (math.isfinite(self.contrast) and self.contrast > 0):
+            raise UsdfabError(f"{self.contrast} is not a contrast above 0", place="contrast")
         if not math.isfinite(self.azimuth):
             raise UsdfabError(f"{self.azimuth} is not an angle", place="azimuth")
         if not 1 <= self.lamps <= MAX_LAMPS:
@@ -204,6 +211,8 @@ def _define_camera(stage: Usd.Stage, path: Sdf.Path, rig: Rig) -> None:
     camera.CreateFocusDistanceAttr(rig.camera_height)
     if rig.blur:
         camera.GetPrim().CreateAttribute(BLUR_ATTRIBUTE, Sdf.ValueTypeNames.Double).Set(rig.blur)
+    if rig.contrast != 1.0:
+        camera.GetPrim().CreateAttribute(CONTRAST_ATTRIBUTE, Sdf.ValueTypeNames.Double).Set(rig.contrast)
     UsdGeom.Xformable(camera).AddTranslateOp().Set(Gf.Vec3d(0.0, 0.0, rig.camera_height))
 
 
