@@ -20,7 +20,7 @@ from usdfab.fit.match_pictures import MOST_SPP, MatchPictures
 from usdfab.fit.match_run import run_match
 from usdfab.fit.match_space import BLUR, BLUR_UNIT, CONTRAST, CONTRAST_RANGE, EXPOSURE, MOVES, MatchSpace, Move
 from usdfab.fit.match_stage import MatchPoint, MatchResult, MatchSettings, checked_match_quality, match_photo
-from usdfab.fit.match_steps import SOFT, broyden_update, damped_step, normal_equations, soft_l1
+from usdfab.fit.match_steps import SOFT, best_step, broyden_update, damped_step, normal_equations, soft_l1
 from usdfab.fit.raster_stage import StageSettings
 from usdfab.fit.texture import Target
 from usdfab.imaging import denoise
@@ -236,6 +236,39 @@ def test_an_unknown_quality_is_refused() -> None:
 
 
 # --- the camera ---
+
+
+@given(least=st.integers(-6, 6), start=st.integers(-6, 6))
+def test_single_steps_lead_to_the_least(least: int, start: int) -> None:
+    seen: list[int] = []
+
+    def look(step: int) -> float:
+        seen.append(step)
+        return abs(step - least - 0.2)
+
+    assert best_step(look, start, lambda loss: loss) == (0.2, least)
+    # Not one is looked at twice, and no further than one beyond.
+    assert len(seen) == len(set(seen)) <= abs(start - least) + 3
+
+
+def test_the_camera_moves_before_the_cloth(net: FeatureNet, goal: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exposure and contrast from one picture of the cloth as it is."""
+    settings = replace(SMALL, free=("albedo", CONTRAST, EXPOSURE), iterations=1)
+    losses: list[tuple[float, float]] = []
+    camera = match_stage._Search._settle_camera
+
+    def watched(search: match_stage._Search) -> None:
+        before, rendered = search.loss, search._done
+        camera(search)
+        losses.append((before, search.loss))
+        assert search._done == rendered
+        assert search.state.way[-1] is search.state.point
+        assert not search.state.point[:-2].any()
+
+    monkeypatch.setattr(match_stage._Search, "_settle_camera", watched)
+    result = match_photo(CLOTH, toned(np.maximum(goal, 0.0), 1.3), settings, net=net, exposure=1.0)
+    assert len(losses) == 1 and losses[0][1] < 0.25 * losses[0][0]
+    assert result.losses[1] == losses[0][1] < result.losses[0]
 
 
 @pytest.mark.parametrize("pixels", [1.2, 0.7, -0.9])

@@ -24,7 +24,7 @@ from usdfab.fabric import FabricParameters
 from usdfab.fit.match_looks import Answers, Seen, best_answers, looks_at, most_looks, questions
 from usdfab.fit.match_pictures import MatchPictures
 from usdfab.fit.match_space import BLUR, CONTRAST, MOVES, OF_THE_CAMERA, MatchSpace, level_of
-from usdfab.fit.match_steps import broyden_update, damped_step, normal_equations, soft_l1
+from usdfab.fit.match_steps import best_step, broyden_update, damped_step, normal_equations, soft_l1
 from usdfab.fit.stage_file import load_stage, save_stage
 from usdfab.tracer.checkpoint import fingerprint
 from usdfab.usd.rig import Rig, blur_in_pixels, rig_for
@@ -41,9 +41,12 @@ LONGEST_STEP = 2.0
 DAMPINGS = (0.01, 0.1, 1.0, 10.0)
 """Tried one after another until a step leads down; each iteration begins with the one that last did."""
 
-LIGHTS = (0.75, 1.0, 1.33)
-"""Exposures in which each first look is taken, times that which makes it as bright as the photo on the mean: what
-suited the looks before does not suit other lamps."""
+LIGHT_STEP = 0.14
+"""Between the exposures in which each first look is seen (of the logarithm), about that which makes it as bright as the
+photo on the mean: what suited the looks before does not suit other lamps."""
+
+CAMERA_STEPS = 3
+"""Of the camera alone, at most, before each round."""
 
 RAYS_PER_PATH = 20.0
 """Of cloth neither dark nor white, about."""
@@ -156,7 +159,7 @@ class MatchResult:
         The points that were taken, from the best look on; the last has the least loss. Its pictures are few samples,
         denoised: seen better, an earlier one may be closer to the photo.
     losses:
-        Of the start and after each step that was taken.
+        Of the start, after each step that was taken, and after the camera alone moved.
     uncertainty:
         Standard deviations by name in the parameters' own units: how far each may move, all others following, before
         the loss grows by ``SPREAD_OF_FIT`` of itself.
@@ -311,6 +314,7 @@ class _Search:
         self._looks = most_looks(self.questions)
         self._done = self.state.round * self._each
         self.loss = math.inf
+        self._lights: dict[Answers, int] = {}
 
     def begin(self) -> None:
         """Take the first looks, or go back to the point where the search stood."""
@@ -342,11 +346,18 @@ class _Search:
         picture = self.pictures.picture(seen.fabric, seen.rig)
         mean = float(self.pictures.mean.mean()) / max(exposure * float(picture.mean()), 1e-6)
         blur, contrast = blur_in_pixels(seen.rig, self.scale), seen.rig.contrast if seen.rig else 1.0
-        found = []
-        for light in (*(mean * factor for factor in LIGHTS), *(() if answers else (1.0,))):
+
+        def look(light: float) -> _Look:
             residuals = self.pictures.residuals(picture, exposure * light, blur, contrast)
-            found.append(_Look(answers, light, picture, residuals, soft_l1(residuals, self.pictures.weights)))
-        best = min(found, key=lambda look: look.loss)
+            return _Look(answers, light, picture, residuals, soft_l1(residuals, self.pictures.weights))
+
+        # From what suited the look before this one.
+        before = self._lights.get(answers[:-1], 0)
+        best, self._lights[answers] = best_step(
+            lambda step: look(mean * math.exp(LIGHT_STEP * step)), before, lambda look: look.loss
+        )
+        if not answers:
+            best = min(best, look(1.0), key=lambda look: look.loss)
         self.loss = min(self.loss, best.loss)
         self._tell(self.loss)
         return best
@@ -376,6 +387,7 @@ class _Search:
         """One round of finite differences, and the steps that follow from it."""
         state, settings = self.state, self.settings
         before = self._done
+        self._settle_camera()
         jacobian, nearby = self._jacobian()
         for step in range(settings.steps):
             matrix, gradient = normal_equations(self.residuals, jacobian, self.pictures.weights)
@@ -391,6 +403,39 @@ class _Search:
         state.round += 1
         self._done = before + self._each
 
+    def _settle_camera(self) -> None:
+        """Exposure, blur and contrast alone, which need no other picture, to where they show this one best.
+
+        What is left is the cloth's, and the derivatives are those of how it is seen.
+        """
+        state, settings = self.state, self.settings
+        camera = np.array([name in OF_THE_CAMERA for name in self.space.names])
+        moving, spread = np.flatnonzero(camera).tolist(), self.space.spread[camera]
+        before = self.loss
+        for _ in range(CAMERA_STEPS if moving else 0):
+            rows = np.stack([self._moved_camera(k) - self.residuals for k in moving])
+            matrix, gradient = normal_equations(self.residuals, rows, self.pictures.weights)
+            for damping in DAMPINGS:
+                point = state.point.copy()
+                point[moving] += damped_step(
+                    matrix, gradient, state.point[moving], spread, settings.prior, damping, LONGEST_STEP
+                )
+                residuals = self._residuals(self.picture, point)
+                loss = self._loss(residuals, point)
+                if loss < self.loss:
+                    break
+            else:
+                break
+            state.point = state.way[-1] = point
+            self.residuals, self.loss = residuals, loss
+        if self.loss < before:
+            state.losses.append(self.loss)
+
+    def _moved_camera(self, coordinate: int) -> Singles:
+        ahead = self.state.point.copy()
+        ahead[coordinate] += 1.0
+        return self._residuals(self.picture, ahead)
+
     def _jacobian(self) -> tuple[Singles, Floats]:
         """Derivatives (P, R) at the point, and the best of the points that show them, if it is better."""
         rows = []
@@ -398,11 +443,11 @@ class _Search:
         sketched, start = self._sketch(here)
         best, least = here, start
         for k, name in enumerate(self.space.names):
+            if name in OF_THE_CAMERA:
+                rows.append(self._moved_camera(k) - self.residuals)
+                continue
             ahead = self.state.point.copy()
             ahead[k] += 1.0
-            if name in OF_THE_CAMERA:
-                rows.append(self._residuals(self.picture, ahead) - self.residuals)
-                continue
             moved, loss = self._sketch(ahead)
             if loss < least:
                 best, least = ahead, loss

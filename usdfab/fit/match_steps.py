@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
+T = TypeVar("T")
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
@@ -60,3 +64,14 @@ def broyden_update(jacobian: Singles, step: Floats, change: Singles) -> None:
         return
     miss = change - direction @ jacobian
     jacobian += np.outer(direction / float(direction @ direction), miss)
+
+
+def best_step(look: Callable[[int], T], start: int, loss: Callable[[T], float]) -> tuple[T, int]:
+    """What is seen at the whole number of least loss that single steps down from ``start`` lead to, and the number."""
+    best, at = look(start), start
+    for way in (1, -1):
+        while loss(there := look(at + way)) < loss(best):
+            best, at = there, at + way
+        if at != start:
+            break
+    return best, at
