@@ -17,7 +17,7 @@ from usdfab.imaging import denoise
 from usdfab.imaging.lens import photographed
 from usdfab.tracer import RenderSettings, Tracer
 from usdfab.tracer.cached_tracer import render_cached
-from usdfab.usd.rig import Rig, blur_in_pixels, rig_for, sample_scene
+from usdfab.usd.rig import Rig, blur_in_pixels, contrast_of, rig_for, sample_scene
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -129,8 +129,7 @@ def clear_picture(
 
 def through_camera(picture: NDArray, rig: Rig | None, pixels_per_meter: float, exposure: float = 1.0) -> NDArray:
     """A clear picture as the rig's camera shows it, times an exposure; the paper's rig, None, is sharp and linear."""
-    contrast = 1.0 if rig is None else rig.contrast
-    return photographed(picture, blur_in_pixels(rig, pixels_per_meter), exposure, contrast)
+    return photographed(picture, blur_in_pixels(rig, pixels_per_meter), exposure, contrast_of(rig))
 
 
 def _channels_first(picture: NDArray) -> Tensor:

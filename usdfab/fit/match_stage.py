@@ -27,7 +27,7 @@ from usdfab.fit.match_space import BLUR, CONTRAST, MOVES, OF_THE_CAMERA, MatchSp
 from usdfab.fit.match_steps import best_step, broyden_update, damped_step, normal_equations, soft_l1
 from usdfab.fit.stage_file import load_stage, save_stage
 from usdfab.tracer.checkpoint import fingerprint
-from usdfab.usd.rig import Rig, blur_in_pixels, rig_for
+from usdfab.usd.rig import Rig, blur_in_pixels, contrast_of, rig_for
 
 if TYPE_CHECKING:
     from usdfab.fit.features import FeatureNet
@@ -345,7 +345,7 @@ class _Search:
         self._done += 1
         picture = self.pictures.picture(seen.fabric, seen.rig)
         mean = float(self.pictures.mean.mean()) / max(exposure * float(picture.mean()), 1e-6)
-        blur, contrast = blur_in_pixels(seen.rig, self.scale), seen.rig.contrast if seen.rig else 1.0
+        blur, contrast = blur_in_pixels(seen.rig, self.scale), contrast_of(seen.rig)
 
         def look(light: float) -> _Look:
             residuals = self.pictures.residuals(picture, exposure * light, blur, contrast)

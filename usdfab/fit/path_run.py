@@ -15,7 +15,7 @@ from usdfab.fit import stages
 from usdfab.fit.stages import StageOutcome
 from usdfab.fit.straighten import straightened
 from usdfab.imaging.lens import toned
-from usdfab.usd.rig import Rig, blur_in_pixels, rig_for, swatch_scene
+from usdfab.usd.rig import Rig, blur_in_pixels, contrast_of, rig_for, swatch_scene
 
 if TYPE_CHECKING:
     from usdfab.fit.path_result import PathResult
@@ -92,7 +92,7 @@ def run_path(
     scale = min(fine, OVERSAMPLING * settings.side / max(start.size))
     target = straightened(photo, rotation, fine, scale)
     seen = (target.shape[1] / scale, target.shape[0] / scale)
-    light = toned(target, 1.0 / rig.contrast if rig else 1.0) / np.float32(exposure)
+    light = toned(target, 1.0 / contrast_of(rig)) / np.float32(exposure)
     result = refine_appearance(
         begin, light, settings=settings,
         scene=swatch_scene(begin, (rig or rig_for(start.size)).with_sample(seen)), blur=blur_in_pixels(rig, scale),

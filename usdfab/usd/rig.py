@@ -246,6 +246,11 @@ def blur_in_pixels(rig: Rig | None, pixels_per_meter: float) -> float:
     return 0.0 if rig is None else rig.blur * pixels_per_meter
 
 
+def contrast_of(rig: Rig | None) -> float:
+    """``Rig.contrast``; the paper's rig, None, is linear."""
+    return 1.0 if rig is None else rig.contrast
+
+
 def swatch_scene(
     fabric: FabricParameters, rig: str | Path | Usd.Stage | Rig | None = None, *, strict: bool = False
 ) -> Scene:
